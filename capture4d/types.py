@@ -1,0 +1,250 @@
+"""The data types that pass between stages: plain frozen dataclasses over numpy arrays.
+
+Metres, seconds, right-handed, Y up, +Z is where the subject faces in the rest pose, +X the subject's left. Arrays are
+float32 and int32 here and on disk; solvers use float64 inside. Frames are named by the capture's own frame number.
+
+Validation lives in `__post_init__` and nowhere else: what a type holds can be relied upon.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, Int32, UInt8
+
+from capture4d.errors import InputError
+
+__all__ = [
+    "Body",
+    "Garment",
+    "GarmentScan",
+    "Mesh",
+    "PoseSequence",
+    "RegisteredSequence",
+    "Rig",
+    "Scan",
+]
+
+
+def _require_array(owner: str, name: str, value: Any, shape: tuple[int | None, ...], dtype: type) -> None:
+    if not isinstance(value, np.ndarray) or value.dtype != np.dtype(dtype):
+        found = value.dtype if isinstance(value, np.ndarray) else type(value).__name__
+        raise InputError(f"{owner}.{name}: expected an array of {np.dtype(dtype)}, found {found}")
+    fits = value.ndim == len(shape) and all(
+        want is None or want == have for want, have in zip(shape, value.shape, strict=True)
+    )
+    if not fits:
+        expected = "(" + ", ".join("*" if want is None else str(want) for want in shape) + ")"
+        raise InputError(f"{owner}.{name}: expected shape {expected}, found {value.shape}")
+
+
+def _require_finite(owner: str, name: str, value: np.ndarray) -> None:
+    if not np.isfinite(value).all():
+        bad = int(np.count_nonzero(~np.isfinite(value).reshape(len(value), -1).all(axis=1)))
+        raise InputError(f"{owner}.{name}: expected finite numbers, found NaN or infinity in {bad} of {len(value)} rows")
+
+
+def _require_indices(owner: str, name: str, value: np.ndarray, count: int) -> None:
+    if value.size and (value.min() < 0 or value.max() >= count):
+        found = int(value.min()) if value.min() < 0 else int(value.max())
+        raise InputError(f"{owner}.{name}: expected indices from 0 to {count - 1}, found {found}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mesh:
+    """A triangle mesh, optionally with a UV per face corner."""
+
+    vertices: Float32[np.ndarray, "verts 3"]
+    """Positions, metres."""
+    faces: Int32[np.ndarray, "faces 3"]
+    """Vertex indices, counter-clockwise seen from outside."""
+    uv: Float32[np.ndarray, "faces 3 2"] | None = None
+    """Texture coordinates per face corner; garment patterns keep them in metres on the panel."""
+
+    def __post_init__(self) -> None:
+        _require_array("Mesh", "vertices", self.vertices, (None, 3), np.float32)
+        _require_array("Mesh", "faces", self.faces, (None, 3), np.int32)
+        _require_finite("Mesh", "vertices", self.vertices)
+        _require_indices("Mesh", "faces", self.faces, len(self.vertices))
+        if self.uv is not None:
+            _require_array("Mesh", "uv", self.uv, (len(self.faces), 3, 2), np.float32)
+            _require_finite("Mesh", "uv", self.uv)
+
+    def with_vertices(self, vertices: Float32[np.ndarray, "verts 3"]) -> Mesh:
+        """The same faces and UVs at other positions."""
+        return Mesh(vertices, self.faces, self.uv)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rig:
+    """Calibrated cameras. Camera axes are OpenCV's: x right, y down, z forward; pixel centres lie at integers."""
+
+    names: tuple[str, ...]
+    intrinsics: np.ndarray
+    """(C, 3, 3) float64, pixels."""
+    distortion: np.ndarray
+    """(C, 5) float64, OpenCV order k1 k2 p1 p2 k3."""
+    T_camera_world: np.ndarray
+    """(C, 4, 4) float64: a world point, metres, in the camera's axes."""
+    image_sizes: np.ndarray
+    """(C, 2) int32: width, height."""
+
+    def __post_init__(self) -> None:
+        count = len(self.names)
+        _require_array("Rig", "intrinsics", self.intrinsics, (count, 3, 3), np.float64)
+        _require_array("Rig", "distortion", self.distortion, (count, 5), np.float64)
+        _require_array("Rig", "T_camera_world", self.T_camera_world, (count, 4, 4), np.float64)
+        _require_array("Rig", "image_sizes", self.image_sizes, (count, 2), np.int32)
+        for name in ("intrinsics", "distortion", "T_camera_world"):
+            _require_finite("Rig", name, getattr(self, name))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scan:
+    """One coloured frame of a 4D capture."""
+
+    mesh: Mesh
+    colours: UInt8[np.ndarray, "verts 3"]
+    """sRGB per vertex."""
+    frame_id: int
+    time_s: float
+
+    def __post_init__(self) -> None:
+        _require_array("Scan", "colours", self.colours, (len(self.mesh.vertices), 3), np.uint8)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GarmentScan:
+    """The garment cut out of a scan: its surface, and the points on its painted borders."""
+
+    mesh: Mesh
+    boundary_points: Float32[np.ndarray, "points 3"]
+    """Points on the true border of the garment, metres."""
+    boundary_loops: Int32[np.ndarray, " points"]
+    """Index into `loop_names` for each boundary point, or -1 where the paint does not tell the loops apart."""
+    loop_names: tuple[str, ...]
+    frame_id: int
+
+    def __post_init__(self) -> None:
+        _require_array("GarmentScan", "boundary_points", self.boundary_points, (None, 3), np.float32)
+        _require_array("GarmentScan", "boundary_loops", self.boundary_loops, (len(self.boundary_points),), np.int32)
+        _require_finite("GarmentScan", "boundary_points", self.boundary_points)
+        _require_indices("GarmentScan", "boundary_loops", self.boundary_loops + 1, len(self.loop_names) + 1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Body:
+    """A skinned parametric body in its rest pose.
+
+    `template + shape_directions @ shape` are the rest vertices, `joints + joint_directions @ shape` the rest joints.
+    Functions in `capture4d.body` shape, pose and skin it.
+    """
+
+    template: Mesh
+    shape_directions: Float32[np.ndarray, "shapes verts 3"]
+    """Displacement for one standard deviation of each shape component, metres."""
+    joints: Float32[np.ndarray, "joints 3"]
+    """Rest joint positions of the mean shape, metres."""
+    joint_directions: Float32[np.ndarray, "shapes joints 3"]
+    joint_names: tuple[str, ...]
+    parents: Int32[np.ndarray, " joints"]
+    """Parent of each joint; -1 for the root, which is joint 0. Parents come before their children."""
+    skin_weights: Float32[np.ndarray, "verts joints"]
+    pose_directions: Float32[np.ndarray, "features verts 3"] | None = None
+    """SMPL-family pose correctives on the flattened (R - I) of all joints but the root; None where the body has none."""
+    regions: UInt8[np.ndarray, " verts"] | None = None
+    """0 body, 1 head, 2 hand, 3 foot: what a suit leaves bare."""
+
+    def __post_init__(self) -> None:
+        verts, joints = len(self.template.vertices), len(self.joint_names)
+        _require_array("Body", "shape_directions", self.shape_directions, (None, verts, 3), np.float32)
+        _require_array("Body", "joints", self.joints, (joints, 3), np.float32)
+        shapes = len(self.shape_directions)
+        _require_array("Body", "joint_directions", self.joint_directions, (shapes, joints, 3), np.float32)
+        _require_array("Body", "parents", self.parents, (joints,), np.int32)
+        _require_array("Body", "skin_weights", self.skin_weights, (verts, joints), np.float32)
+        if self.parents[0] != -1 or (self.parents[1:] >= np.arange(1, joints)).any() or (self.parents[1:] < 0).any():
+            raise InputError("Body.parents: expected joint 0 as the root and every parent before its children")
+        if np.abs(self.skin_weights.sum(axis=1) - 1).max(initial=0) > 1e-3:
+            raise InputError("Body.skin_weights: expected rows that sum to 1")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseSequence:
+    """Joint rotations over time, for one body shape.
+
+    Rotations are relative to the rest pose and about world-aligned axes, as SMPL's are: identity everywhere is the
+    rest pose.
+    """
+
+    rotations: Float32[np.ndarray, "frames joints 3 3"]
+    translations: Float32[np.ndarray, "frames 3"]
+    """Displacement of the root joint from its rest position, metres."""
+    shape: Float32[np.ndarray, " shapes"]
+    frame_ids: Int32[np.ndarray, " frames"]
+    fps: float
+    joint_names: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        frames, joints = len(self.frame_ids), len(self.joint_names)
+        _require_array("PoseSequence", "rotations", self.rotations, (frames, joints, 3, 3), np.float32)
+        _require_array("PoseSequence", "translations", self.translations, (frames, 3), np.float32)
+        _require_array("PoseSequence", "shape", self.shape, (None,), np.float32)
+        _require_array("PoseSequence", "frame_ids", self.frame_ids, (frames,), np.int32)
+        _require_finite("PoseSequence", "rotations", self.rotations)
+        _require_finite("PoseSequence", "translations", self.translations)
+        if not self.fps > 0:
+            raise InputError(f"PoseSequence.fps: expected a positive frame rate, found {self.fps}")
+        if len(np.unique(self.frame_ids)) != frames:
+            raise InputError("PoseSequence.frame_ids: expected every frame once, found duplicates")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Garment:
+    """A garment template, bound to a body.
+
+    The template lies in the body's rest pose. `embedding_faces` and `embedding_barycentric` name the body surface
+    point each vertex belongs to; `skin_weights` move it with the skeleton.
+    """
+
+    template: Mesh
+    loops: Mapping[str, Int32[np.ndarray, " loop"]] = field(default_factory=dict)
+    """Named boundary loops: vertex indices in order along the open edge, the first not repeated at the end."""
+    embedding_faces: Int32[np.ndarray, " verts"] | None = None
+    embedding_barycentric: Float32[np.ndarray, "verts 3"] | None = None
+    skin_weights: Float32[np.ndarray, "verts joints"] | None = None
+    """None for a garment (or any other template) without a body."""
+
+    def __post_init__(self) -> None:
+        verts = len(self.template.vertices)
+        for name, loop in self.loops.items():
+            _require_array("Garment", f"loops[{name!r}]", loop, (None,), np.int32)
+            _require_indices("Garment", f"loops[{name!r}]", loop, verts)
+        if self.embedding_faces is not None:
+            _require_array("Garment", "embedding_faces", self.embedding_faces, (verts,), np.int32)
+            _require_array("Garment", "embedding_barycentric", self.embedding_barycentric, (verts, 3), np.float32)
+        if self.skin_weights is not None:
+            _require_array("Garment", "skin_weights", self.skin_weights, (verts, None), np.float32)
+            if np.abs(self.skin_weights.sum(axis=1) - 1).max(initial=0) > 1e-3:
+                raise InputError("Garment.skin_weights: expected rows that sum to 1")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RegisteredSequence:
+    """One template on every frame of a take: the same vertex is the same piece of cloth."""
+
+    garment: Garment
+    vertices: Float32[np.ndarray, "frames verts 3"]
+    residual_m: Float32[np.ndarray, "frames verts"]
+    """Distance to the scan surface; NaN where the scan has no data near the vertex."""
+    frame_ids: Int32[np.ndarray, " frames"]
+
+    def __post_init__(self) -> None:
+        frames, verts = len(self.frame_ids), len(self.garment.template.vertices)
+        _require_array("RegisteredSequence", "vertices", self.vertices, (frames, verts, 3), np.float32)
+        _require_array("RegisteredSequence", "residual_m", self.residual_m, (frames, verts), np.float32)
+        _require_array("RegisteredSequence", "frame_ids", self.frame_ids, (frames,), np.int32)
+        _require_finite("RegisteredSequence", "vertices", self.vertices)

@@ -1,0 +1,1 @@
+"""Non-rigid registration of one template to a sequence of scans."""

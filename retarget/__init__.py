@@ -1,0 +1,1 @@
+"""The garment as a model: blendshapes, pose regression, new bodies and styles."""

@@ -1,0 +1,1 @@
+"""Normal maps and offset images: the detail that the template cannot carry."""
