@@ -1,0 +1,518 @@
+"""The capture folder: what a lab hands in, and what the synthetic scanner writes.
+
+    CAPTURE/
+      capture.json                    name, frame rate, paint colours
+      scans/000123.ply                one coloured mesh per frame (ply, glb or obj)
+      poses.npz body.npz              motion capture and the body it moves            [optional]
+      template.npz or template.obj    garment to register                             [optional]
+      rig.json                        cameras                                         [optional]
+      truth/model.npz truth/000123.npz    exact surfaces, from the synthetic scanner  [optional]
+
+docs/conventions.md describes every file, so that it can be written without this package.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+from jaxtyping import Float32, Int32, UInt8
+
+from capture4d.errors import InputError
+from capture4d.mesh import boundary_loops
+from capture4d.mesh_files import MESH_SUFFIXES, read_mesh, write_mesh
+from capture4d.types import Body, Garment, Mesh, PoseSequence, Rig, Scan
+from capture4d.workdir import read_json, write_json, write_npz
+
+__all__ = [
+    "Capture",
+    "Colour",
+    "TruthFrame",
+    "TruthModel",
+    "capture_digest",
+    "format_colour",
+    "load_body",
+    "load_garment",
+    "load_poses",
+    "load_rig",
+    "parse_colour",
+    "read_body",
+    "read_capture",
+    "read_poses",
+    "read_rig",
+    "read_scan",
+    "read_template",
+    "read_truth_frame",
+    "read_truth_model",
+    "read_truth_vertices",
+    "save_body",
+    "save_garment",
+    "save_poses",
+    "save_rig",
+    "scan_path",
+    "write_capture_description",
+    "write_scan",
+    "write_truth_frame",
+    "write_truth_model",
+]
+
+_FORMAT = 1
+
+Colour = tuple[int, int, int]
+"""sRGB, 0 to 255."""
+
+Units = Literal["m", "cm", "mm"]
+_METRES: dict[Units, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Capture:
+    """A take: the description of a capture folder. Scans are read one by one, with `read_scan`."""
+
+    path: Path
+    name: str
+    fps: float
+    frame_ids: tuple[int, ...]
+    """The capture's own frame numbers, ascending."""
+    garment_colour: Colour
+    boundary_colours: Mapping[str, Colour] = field(default_factory=dict)
+    """Paint on each border loop; the same colour may serve several. Empty: no painted borders."""
+    units: Units = "m"
+    """Of the scan files. What `read_scan` returns is in metres."""
+
+    def __post_init__(self) -> None:
+        if not self.frame_ids:
+            raise InputError(f"{self.path}: expected at least one frame, found none")
+        if not self.fps > 0:
+            raise InputError(f"{self.path}: expected a positive frame rate, found {self.fps}")
+        if list(self.frame_ids) != sorted(set(self.frame_ids)) or self.frame_ids[0] < 0:
+            raise InputError(f"{self.path}: expected ascending frame numbers, each once and none negative")
+        if self.units not in _METRES:
+            raise InputError(f"{self.path}: expected units {', '.join(get_args(Units))}, found '{self.units}'")
+
+    def time_s(self, frame_id: int) -> float:
+        """Time of a frame since the first."""
+        return (frame_id - self.frame_ids[0]) / self.fps
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TruthModel:
+    """What the synthetic scanner knows about a take."""
+
+    fine: Mesh
+    """The simulated garment in its rest state; its faces and UVs hold for every frame."""
+    loops: Mapping[str, Int32[np.ndarray, " loop"]]
+    """Border loops of `fine`."""
+    template_faces: Int32[np.ndarray, " verts"]
+    """Material map: the face of `fine` each vertex of the registration template lies on, ..."""
+    template_barycentric: Float32[np.ndarray, "verts 3"]
+    """... and where in it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TruthFrame:
+    """The exact state of one synthetic frame."""
+
+    vertices: Float32[np.ndarray, "fine 3"]
+    """Of `TruthModel.fine`, metres."""
+    rotations: Float32[np.ndarray, "joints 3 3"]
+    translation: Float32[np.ndarray, " 3"]
+    labels: UInt8[np.ndarray, " scan"]
+    """Per scan vertex: 0 body, 1 garment, 2 painted border."""
+
+
+# --- description and scans ---------------------------------------------------------------------------------------
+
+
+def parse_colour(text: str) -> Colour:
+    """'#2f62c9' or '2f62c9' as numbers."""
+    if not isinstance(text, str) or not re.fullmatch(r"#?[0-9a-fA-F]{6}", text):
+        raise InputError(f"expected a colour such as #2f62c9, found '{text}'")
+    red, green, blue = bytes.fromhex(text.removeprefix("#"))
+    return red, green, blue
+
+
+def format_colour(colour: Colour) -> str:
+    return "#{:02x}{:02x}{:02x}".format(*colour)
+
+
+def read_capture(path: str | Path) -> Capture:
+    """Read `capture.json`, and see that every frame it names has a scan.
+
+    Raises:
+        InputError: the folder, the description or a scan is missing, or the description is wrong.
+    """
+    path = Path(path)
+    description = path / "capture.json"
+    if not path.is_dir():
+        raise InputError(f"{path}: no such capture folder")
+    if not description.is_file():
+        raise InputError(f"{description}: no such file; a capture folder needs one (see docs/conventions.md)")
+    found = read_json(description)
+    present = _scan_numbers(path)
+    try:
+        if found.get("format") != _FORMAT:
+            raise InputError(f"expected format {_FORMAT}, found {found.get('format')}")
+        capture = Capture(
+            path=path,
+            name=str(found.get("name", path.resolve().name)),
+            fps=float(found["fps"]),
+            frame_ids=tuple(int(frame_id) for frame_id in found.get("frames") or sorted(present)),
+            garment_colour=parse_colour(found["garment_colour"]),
+            boundary_colours={name: parse_colour(text) for name, text in found.get("boundary_colours", {}).items()},
+            units=found.get("units", "m"),
+        )
+    except InputError as error:
+        raise InputError(f"{description}: {str(error).removeprefix(f'{path}: ')}") from None
+    except KeyError as error:
+        raise InputError(f"{description}: expected the entry {error}, found none") from None
+    except (AttributeError, TypeError, ValueError) as error:
+        raise InputError(f"{description}: {error}") from None
+    missing = [frame_id for frame_id in capture.frame_ids if frame_id not in present]
+    if missing:
+        raise InputError(f"{path / 'scans' / f'{missing[0]:06d}.ply'}: no such scan; {len(missing)} of "
+                         f"{len(capture.frame_ids)} frames in capture.json have none")
+    return capture
+
+
+def write_capture_description(capture: Capture) -> None:
+    """Write `capture.json` into the capture's folder."""
+    write_json(
+        capture.path / "capture.json",
+        {
+            "format": _FORMAT,
+            "name": capture.name,
+            "fps": capture.fps,
+            "units": capture.units,
+            "garment_colour": format_colour(capture.garment_colour),
+            "boundary_colours": {name: format_colour(colour) for name, colour in capture.boundary_colours.items()},
+            "frames": list(capture.frame_ids),
+        },
+    )
+
+
+def scan_path(capture: Capture, frame_id: int) -> Path:
+    """The file of a frame's scan.
+
+    Raises:
+        InputError: there is none.
+    """
+    for suffix in (".ply", ".glb", ".obj"):
+        path = capture.path / "scans" / f"{frame_id:06d}{suffix}"
+        if path.is_file():
+            return path
+    raise InputError(f"{capture.path / 'scans' / f'{frame_id:06d}.ply'}: no such scan")
+
+
+def read_scan(capture: Capture, frame_id: int) -> Scan:
+    """Read one frame, in metres.
+
+    Raises:
+        InputError: the scan is missing, damaged, or has no vertex colours.
+    """
+    path = scan_path(capture, frame_id)
+    found = read_mesh(path)
+    if found.colours is None:
+        raise InputError(f"{path}: expected a colour per vertex, found none")
+    mesh = found.mesh
+    if capture.units != "m":
+        mesh = mesh.with_vertices(mesh.vertices * np.float32(_METRES[capture.units]))
+    return Scan(mesh, found.colours, frame_id, capture.time_s(frame_id))
+
+
+def write_scan(path: str | Path, scan: Scan) -> None:
+    write_mesh(path, scan.mesh, colours=scan.colours)
+
+
+def capture_digest(capture: Capture) -> str:
+    """Digest of what a stage reads from a capture: the small files whole, the scans by name and size."""
+    total = hashlib.sha256()
+    for name in ("capture.json", "poses.npz", "body.npz", "template.npz", "template.obj"):
+        path = capture.path / name
+        if path.is_file():
+            total.update(f"{name} {hashlib.sha256(path.read_bytes()).hexdigest()}\n".encode())
+    for frame_id in capture.frame_ids:
+        path = scan_path(capture, frame_id)
+        total.update(f"{path.name} {path.stat().st_size}\n".encode())
+    return total.hexdigest()
+
+
+def _scan_numbers(path: Path) -> set[int]:
+    folder = path / "scans"
+    if not folder.is_dir():
+        return set()
+    return {int(file.stem) for file in folder.iterdir() if file.suffix in MESH_SUFFIXES and file.stem.isdecimal()}
+
+
+# --- what else a capture may hold --------------------------------------------------------------------------------
+
+
+def read_poses(capture: Capture) -> PoseSequence | None:
+    """The poses of the take, one per scan and in their order; None if the capture has none.
+
+    Raises:
+        InputError: a scan has no pose.
+    """
+    path = capture.path / "poses.npz"
+    if not path.is_file():
+        return None
+    poses = load_poses(path)
+    index = {int(frame_id): row for row, frame_id in enumerate(poses.frame_ids)}
+    missing = [frame_id for frame_id in capture.frame_ids if frame_id not in index]
+    if missing:
+        raise InputError(
+            f"{path}: expected a pose for each of {len(capture.frame_ids)} scans, found none for {len(missing)} of them, "
+            f"frame {missing[0]} first"
+        )
+    rows = [index[frame_id] for frame_id in capture.frame_ids]
+    return replace(
+        poses,
+        rotations=poses.rotations[rows],
+        translations=poses.translations[rows],
+        frame_ids=np.array(capture.frame_ids, np.int32),
+    )
+
+
+def read_body(capture: Capture) -> Body | None:
+    path = capture.path / "body.npz"
+    return load_body(path) if path.is_file() else None
+
+
+def read_rig(capture: Capture) -> Rig | None:
+    path = capture.path / "rig.json"
+    return load_rig(path) if path.is_file() else None
+
+
+def read_template(capture: Capture) -> Garment:
+    """The garment to register: `template.npz`, or a bare mesh `template.obj` with loops called border_0, border_1, ...
+
+    Raises:
+        InputError: there is neither.
+    """
+    if (capture.path / "template.npz").is_file():
+        return load_garment(capture.path / "template.npz")
+    for suffix in MESH_SUFFIXES:
+        path = capture.path / f"template{suffix}"
+        if path.is_file():
+            mesh = read_mesh(path).mesh
+            if capture.units != "m":
+                mesh = mesh.with_vertices(mesh.vertices * np.float32(_METRES[capture.units]))
+            return Garment(mesh, {f"border_{index}": loop for index, loop in enumerate(boundary_loops(mesh.faces))})
+    raise InputError(f"{capture.path / 'template.npz'}: no such file, nor a template.obj; registration needs a template")
+
+
+def save_body(path: str | Path, body: Body) -> None:
+    optional = {"pose_directions": body.pose_directions, "regions": body.regions}
+    write_npz(
+        path,
+        **_mesh_arrays("template_", body.template),
+        shape_directions=body.shape_directions,
+        joints=body.joints,
+        joint_directions=body.joint_directions,
+        joint_names=np.array(body.joint_names),
+        parents=body.parents,
+        skin_weights=body.skin_weights,
+        **{name: array for name, array in optional.items() if array is not None},
+    )
+
+
+def load_body(path: str | Path) -> Body:
+    with _Arrays(path) as arrays:
+        return Body(
+            template=arrays.mesh("template_"),
+            shape_directions=arrays["shape_directions"],
+            joints=arrays["joints"],
+            joint_directions=arrays["joint_directions"],
+            joint_names=arrays.names("joint_names"),
+            parents=arrays["parents"],
+            skin_weights=arrays["skin_weights"],
+            pose_directions=arrays.get("pose_directions"),
+            regions=arrays.get("regions"),
+        )
+
+
+def save_poses(path: str | Path, poses: PoseSequence) -> None:
+    write_npz(
+        path,
+        rotations=poses.rotations,
+        translations=poses.translations,
+        shape=poses.shape,
+        frame_ids=poses.frame_ids,
+        fps=np.float64(poses.fps),
+        joint_names=np.array(poses.joint_names),
+    )
+
+
+def load_poses(path: str | Path) -> PoseSequence:
+    with _Arrays(path) as arrays:
+        return PoseSequence(
+            rotations=arrays["rotations"],
+            translations=arrays["translations"],
+            shape=arrays["shape"],
+            frame_ids=arrays["frame_ids"],
+            fps=float(arrays["fps"]),
+            joint_names=arrays.names("joint_names"),
+        )
+
+
+def save_garment(path: str | Path, garment: Garment) -> None:
+    optional = {
+        "embedding_faces": garment.embedding_faces,
+        "embedding_barycentric": garment.embedding_barycentric,
+        "skin_weights": garment.skin_weights,
+    }
+    write_npz(
+        path,
+        **_mesh_arrays("template_", garment.template),
+        **{f"loop_{name}": loop for name, loop in garment.loops.items()},
+        **{name: array for name, array in optional.items() if array is not None},
+    )
+
+
+def load_garment(path: str | Path) -> Garment:
+    with _Arrays(path) as arrays:
+        return Garment(
+            template=arrays.mesh("template_"),
+            loops=arrays.prefixed("loop_"),
+            embedding_faces=arrays.get("embedding_faces"),
+            embedding_barycentric=arrays.get("embedding_barycentric"),
+            skin_weights=arrays.get("skin_weights"),
+        )
+
+
+def save_rig(path: str | Path, rig: Rig) -> None:
+    cameras = [
+        {
+            "name": name,
+            "width": int(rig.image_sizes[index, 0]),
+            "height": int(rig.image_sizes[index, 1]),
+            "intrinsics": rig.intrinsics[index],
+            "distortion": rig.distortion[index],
+            "T_camera_world": rig.T_camera_world[index],
+        }
+        for index, name in enumerate(rig.names)
+    ]
+    write_json(path, {"format": _FORMAT, "cameras": cameras})
+
+
+def load_rig(path: str | Path) -> Rig:
+    cameras = read_json(path)
+    try:
+        cameras = cameras["cameras"]
+        return Rig(
+            names=tuple(str(camera["name"]) for camera in cameras),
+            intrinsics=np.array([camera["intrinsics"] for camera in cameras], np.float64),
+            distortion=np.array([camera["distortion"] for camera in cameras], np.float64),
+            T_camera_world=np.array([camera["T_camera_world"] for camera in cameras], np.float64),
+            image_sizes=np.array([[camera["width"], camera["height"]] for camera in cameras], np.int32),
+        )
+    except KeyError as error:
+        raise InputError(f"{path}: expected the entry {error} for every camera, found none") from None
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+# --- truth -------------------------------------------------------------------------------------------------------
+
+
+def write_truth_model(path: str | Path, model: TruthModel) -> None:
+    write_npz(
+        path,
+        **_mesh_arrays("fine_", model.fine),
+        **{f"loop_{name}": loop for name, loop in model.loops.items()},
+        template_faces=model.template_faces,
+        template_barycentric=model.template_barycentric,
+    )
+
+
+def read_truth_model(capture: Capture) -> TruthModel | None:
+    path = capture.path / "truth" / "model.npz"
+    if not path.is_file():
+        return None
+    with _Arrays(path) as arrays:
+        return TruthModel(
+            fine=arrays.mesh("fine_"),
+            loops=arrays.prefixed("loop_"),
+            template_faces=arrays["template_faces"],
+            template_barycentric=arrays["template_barycentric"],
+        )
+
+
+def write_truth_frame(path: str | Path, frame: TruthFrame) -> None:
+    write_npz(
+        path,
+        vertices=frame.vertices,
+        rotations=frame.rotations,
+        translation=frame.translation,
+        labels=frame.labels,
+    )
+
+
+def read_truth_frame(capture: Capture, frame_id: int) -> TruthFrame:
+    with _Arrays(_truth_path(capture, frame_id)) as arrays:
+        return TruthFrame(arrays["vertices"], arrays["rotations"], arrays["translation"], arrays["labels"])
+
+
+def read_truth_vertices(capture: Capture, frame_id: int) -> Float32[np.ndarray, "fine 3"]:
+    with _Arrays(_truth_path(capture, frame_id)) as arrays:
+        return arrays["vertices"]
+
+
+def _truth_path(capture: Capture, frame_id: int) -> Path:
+    return capture.path / "truth" / f"{frame_id:06d}.npz"
+
+
+# --- npz ---------------------------------------------------------------------------------------------------------
+
+
+def _mesh_arrays(prefix: str, mesh: Mesh) -> dict[str, np.ndarray]:
+    arrays = {f"{prefix}vertices": mesh.vertices, f"{prefix}faces": mesh.faces}
+    return arrays if mesh.uv is None else {**arrays, f"{prefix}uv": mesh.uv}
+
+
+class _Arrays:
+    """An open npz file in which everything that is wrong becomes an InputError that names the file."""
+
+    def __init__(self, path: str | Path) -> None:
+        self._path = Path(path)
+
+    def __enter__(self) -> _Arrays:
+        try:
+            self._file = np.load(self._path, allow_pickle=False)
+            self._names = self._file.files
+        except FileNotFoundError:
+            raise InputError(f"{self._path}: no such file") from None
+        except (ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+            raise InputError(f"{self._path}: not a readable npz file, cut off or damaged ({error})") from None
+        return self
+
+    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
+        self._file.close()
+        if isinstance(error, InputError) and not str(error).startswith(str(self._path)):
+            raise InputError(f"{self._path}: {error}") from None
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        if name not in self._names:
+            raise InputError(f"{self._path}: expected an array '{name}', found {', '.join(self._names) or 'none'}")
+        try:
+            return self._file[name]
+        except (ValueError, EOFError, zipfile.BadZipFile) as error:
+            raise InputError(f"{self._path}: damaged array '{name}' ({error})") from None
+
+    def get(self, name: str) -> np.ndarray | None:
+        return self[name] if name in self._names else None
+
+    def names(self, name: str) -> tuple[str, ...]:
+        return tuple(str(entry) for entry in self[name])
+
+    def prefixed(self, prefix: str) -> dict[str, np.ndarray]:
+        return {name.removeprefix(prefix): self[name] for name in self._names if name.startswith(prefix)}
+
+    def mesh(self, prefix: str) -> Mesh:
+        return Mesh(self[f"{prefix}vertices"], self[f"{prefix}faces"], self.get(f"{prefix}uv"))
