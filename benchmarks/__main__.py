@@ -1,0 +1,68 @@
+"""Measure: `python -m benchmarks NAME [--quick] [--json FILE] [--gate] [options of the benchmark]`.
+
+--quick measures the same keys on a smaller case; --json also writes the metrics to FILE; --gate exits with 1 if one
+is worse than benchmarks/baseline.json allows.
+
+A benchmark is a module of this package with a function `run(*, quick: bool = False, ...) -> list[Metric]`; its other
+keyword arguments become its options.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+import benchmarks
+from benchmarks.metric import Metric, broken_limits, write_metrics
+
+
+@dataclass(frozen=True)
+class Outlet:
+    json: Path | None = None
+    gate: bool = False
+
+
+def main(arguments: list[str]) -> int:
+    modules = [module.name for module in pkgutil.iter_modules(benchmarks.__path__)]
+    names = [name for name in modules if name not in ("__main__", "metric")]
+    if not arguments or arguments[0] not in names:
+        print(f"{__doc__}\nNAME is one of: {', '.join(names)}")
+        return 0 if arguments in (["--help"], ["-h"]) else 2
+
+    name, *rest = arguments
+    run = importlib.import_module(f"benchmarks.{name}").run
+    outlet, rest = tyro.cli(Outlet, args=rest, return_unknown_args=True, add_help=False)
+    started = time.perf_counter()
+    metrics: list[Metric] = tyro.cli(run, prog=f"python -m benchmarks {name}", args=rest)
+    _print_table(name, metrics, time.perf_counter() - started)
+
+    if outlet.json:
+        write_metrics(outlet.json, metrics)
+    if not outlet.gate:
+        return 0
+    broken = broken_limits(f"{name}-quick" if "--quick" in rest else name, metrics)
+    for line in broken:
+        print(f"gate: {line}", file=sys.stderr)
+    return 1 if broken else 0
+
+
+def _print_table(name: str, metrics: list[Metric], seconds: float) -> None:
+    table = Table("metric", title=f"{name} ({seconds:.0f} s)", title_justify="left")
+    table.add_column("value", justify="right")
+    table.add_column("unit")
+    table.add_column("better")
+    for metric in metrics:
+        table.add_row(metric.key, f"{metric.value:.4g}", metric.unit, metric.better)
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
