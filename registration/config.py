@@ -1,0 +1,201 @@
+"""Settings of the registration, split by role. Standard library only: the command line imports this to print its help.
+
+Energies (each a mean of squares, in m^2, so that a weight keeps its meaning when the template, the number of nodes or
+the scan get finer; the paper gives its weights without units and says "triangle" where its unknowns are grid nodes):
+
+    E_data    mean over template vertices of the squared distance to the matched scan plane
+    E_rigid   node spacing squared times the mean over nodes of the six squared violations of A^T A = I
+    E_smooth  mean over pairs of neighbouring nodes of the squared disagreement about the neighbour's position
+    E_bound   mean over template border vertices of the squared distance to their targets
+
+`PAPER` takes the printed constants 500, 500, 10 in these units (DeepWrinkles, ECCV 2018, Eq. 1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+__all__ = [
+    "PAPER",
+    "PRESETS",
+    "BoundaryConfig",
+    "CoarseConfig",
+    "DataConfig",
+    "DenseConfig",
+    "GraphConfig",
+    "LinearSolverConfig",
+    "QualityConfig",
+    "RegistrationConfig",
+    "Schedule",
+    "SequenceConfig",
+]
+
+BoundaryRule = Literal["argmax", "nearest", "mean", "none"]
+
+
+@dataclass(frozen=True, slots=True)
+class GraphConfig:
+    """The deformation graph, sampled on the template once."""
+
+    nodes: int = 300
+    """Number of affine nodes, spread along the surface."""
+    nodes_per_vertex: int = 6
+    """How many nodes move one vertex."""
+    vertices: int = 1000
+    """Template vertices that carry the data term of the coarse stage, besides all border vertices; 0 for all."""
+
+
+@dataclass(frozen=True, slots=True)
+class LinearSolverConfig:
+    """Block-Jacobi preconditioned conjugate gradients inside each Gauss-Newton step."""
+
+    tolerance: float = 1e-2
+    """Relative residual at which to stop; tighter changes nothing but the time."""
+    max_iterations: int = 120
+    """Iterations at most."""
+
+
+@dataclass(frozen=True, slots=True)
+class DataConfig:
+    """Which scan points a template vertex may be pulled to."""
+
+    min_normal_cosine: float = 0.4
+    """Reject a match whose normals differ by more than this angle's cosine."""
+    robust_scale: float = 0.4
+    """Scale of the Geman-McClure weight, as a share of the distance gate."""
+    point_share: float = 0.0
+    """Weight of the tangential part of the match: 0 is point-to-plane, 1 is point-to-point."""
+    smoothing_passes: int = 1
+    """Laplacian passes over the scan before its normals are taken."""
+
+
+@dataclass(frozen=True, slots=True)
+class BoundaryConfig:
+    """Painted borders: DeepWrinkles Eq. 2 and its variants."""
+
+    coarse_rule: BoundaryRule = "argmax"
+    """Which of a border vertex's voters is its target in the coarse stage; argmax is Eq. 2."""
+    dense_rule: BoundaryRule = "mean"
+    """The same in the dense stage."""
+    along_curve: bool = True
+    """Drop the residual along the border, so that border vertices are not slid along the curve (dense stage)."""
+    gate: float = 0.12
+    """Farthest target, metres."""
+    max_points: int = 3000
+    """Scan border points are thinned to this many."""
+
+
+@dataclass(frozen=True, slots=True)
+class Schedule:
+    """A run of Gauss-Newton steps whose weights and gates move geometrically from first to last."""
+
+    steps: int
+    """Gauss-Newton steps; correspondences are renewed before each."""
+    gate: tuple[float, float]
+    """Distance gate of the data term, metres, first and last step."""
+    rigid: tuple[float, float] = (0.0, 0.0)
+    """Weight of E_rigid, first and last step."""
+    smooth: tuple[float, float] = (0.0, 0.0)
+    """Weight of E_smooth (coarse) or of the displacement's bending (dense)."""
+    stretch: tuple[float, float] = (0.0, 0.0)
+    """Weight of the edge lengths against the template's (dense stage)."""
+    anchor: tuple[float, float] = (0.0, 0.0)
+    """Weight of the tangential distance to the start (dense stage)."""
+    boundary: tuple[float, float] = (2.0, 2.0)
+    """Weight of E_bound."""
+
+
+@dataclass(frozen=True, slots=True)
+class CoarseConfig:
+    """The deformation graph stage."""
+
+    cold: Schedule = Schedule(8, (0.12, 0.05), rigid=(100.0, 3.0), smooth=(60.0, 2.0))
+    """From a skinned template or another distant start."""
+    warm: Schedule = Schedule(2, (0.05, 0.03), rigid=(50.0, 50.0), smooth=(60.0, 60.0))
+    """From the frame before."""
+
+
+@dataclass(frozen=True, slots=True)
+class DenseConfig:
+    """The per-vertex stage."""
+
+    cold: Schedule = Schedule(6, (0.03, 0.012), smooth=(0.05, 0.02), stretch=(0.03, 0.03), boundary=(0.1, 0.1))
+    """After a cold coarse stage."""
+    warm: Schedule = Schedule(3, (0.02, 0.012), smooth=(0.03, 0.02), stretch=(0.03, 0.03), boundary=(0.1, 0.1))
+    """After a warm coarse stage."""
+    plasticity: float = 0.5
+    """Share of the bending that is forgiven between steps: 0 keeps the shape of the coarse stage, 1 only damps change."""
+    compression: float = 0.2
+    """Share of the stretch weight that resists shortening: folds finer than the template's edges shorten them."""
+
+
+@dataclass(frozen=True, slots=True)
+class SequenceConfig:
+    """How a take is cut up and where each frame starts."""
+
+    segment: int = 30
+    """Frames per segment; segments start from keyframes and run in parallel."""
+    start: Literal["best", "previous", "skinned"] = "best"
+    """Start of a frame inside a segment: the frame before, the skinned pose, or whichever is nearer to the scan."""
+    carry: float = 1.0
+    """Share of the offsets from the skinned pose that a frame hands to the next, in the pose-normalised space."""
+    cold_above: float = 0.008
+    """Take the cold schedule when the median distance from start to scan exceeds this, metres."""
+
+
+@dataclass(frozen=True, slots=True)
+class QualityConfig:
+    """When a frame is good, to be checked, or failed."""
+
+    fit_check_mm: float = 1.0
+    """Mean distance to the scan above which a frame is to be checked."""
+    fit_fail_mm: float = 5.0
+    """Mean distance to the scan above which a frame has failed."""
+    boundary_check_mm: float = 3.0
+    """Mean border error above which a frame is to be checked."""
+    boundary_fail_mm: float = 15.0
+    """Mean border error above which a frame has failed."""
+    stretch_check: float = 1.4
+    """99th percentile of edge stretch above which a frame is to be checked."""
+    stretch_fail: float = 2.5
+    """99th percentile of edge stretch above which a frame has failed."""
+    flipped_check_percent: float = 1.0
+    """Share of faces against the scan's normals above which a frame is to be checked."""
+    intersections_check_percent: float = 2.0
+    """Share of faces that cut another face above which a frame is to be checked."""
+    min_covered_percent: float = 40.0
+    """Share of vertices with scan data below which a frame has failed."""
+
+
+@dataclass(frozen=True, slots=True)
+class RegistrationConfig:
+    """Everything the registration stage reads."""
+
+    mode: Literal["default", "paper"] = "default"
+    """default: annealed weights and a dense stage; paper: DeepWrinkles as printed, constant weights, no dense stage."""
+    graph: GraphConfig = field(default_factory=GraphConfig)
+    solver: LinearSolverConfig = field(default_factory=LinearSolverConfig)
+    data: DataConfig = field(default_factory=DataConfig)
+    boundary: BoundaryConfig = field(default_factory=BoundaryConfig)
+    coarse: CoarseConfig = field(default_factory=CoarseConfig)
+    dense: DenseConfig = field(default_factory=DenseConfig)
+    sequence: SequenceConfig = field(default_factory=SequenceConfig)
+    quality: QualityConfig = field(default_factory=QualityConfig)
+
+
+PAPER_SCHEDULE = Schedule(30, (0.12, 0.12), rigid=(500.0, 500.0), smooth=(500.0, 500.0), boundary=(10.0, 10.0))
+NO_STEPS = Schedule(0, (0.03, 0.012))
+
+PAPER = RegistrationConfig(
+    mode="paper",
+    graph=GraphConfig(nodes=800, vertices=0),
+    data=DataConfig(point_share=1.0, smoothing_passes=0),
+    boundary=BoundaryConfig(coarse_rule="argmax", dense_rule="argmax", along_curve=False),
+    coarse=CoarseConfig(cold=PAPER_SCHEDULE, warm=PAPER_SCHEDULE),
+    dense=DenseConfig(cold=NO_STEPS, warm=NO_STEPS),
+    sequence=SequenceConfig(start="skinned", carry=0.0),
+)
+
+PRESETS: Mapping[str, RegistrationConfig] = {"default": RegistrationConfig(), "paper": PAPER}

@@ -1,0 +1,173 @@
+"""What the template is matched to: the scan's surface, smoothed once, with normals and a search tree.
+
+A template vertex is matched to its nearest scan vertex and measured against the plane there. With 2-3 mm between scan
+vertices that is as good as the closest point of the triangles and half the time; matches on the rims of holes are kept,
+because a plane continues sensibly into a hole.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float64, Int, Integer
+from numba import njit
+from scipy.spatial import cKDTree
+
+__all__ = ["Matches", "ScanSurface", "match", "mesh_normals", "prepare_scan"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanSurface:
+    """A scan ready to be matched against."""
+
+    points: Float64[np.ndarray, "points 3"]
+    """Smoothed vertices, metres."""
+    normals: Float64[np.ndarray, "points 3"]
+    """Unit normals."""
+    rim: Bool[np.ndarray, " points"]
+    """True on open edges: borders and the rims of holes."""
+    tree: cKDTree
+    spacing: float
+    """Mean edge length, metres: what the scan resolves."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Matches:
+    """One matched plane per query point."""
+
+    points: Float64[np.ndarray, "queries 3"]
+    normals: Float64[np.ndarray, "queries 3"]
+    weights: Float64[np.ndarray, " queries"]
+    """0 where the gates reject the match."""
+    distances: Float64[np.ndarray, " queries"]
+    """To the nearest scan vertex, metres; infinite beyond the gate."""
+    indices: Int[np.ndarray, " queries"]
+    """Matched scan vertex; the number of scan vertices beyond the gate."""
+
+
+def prepare_scan(
+    vertices: Float[np.ndarray, "points 3"], faces: Integer[np.ndarray, "faces 3"], *, smoothing_passes: int
+) -> ScanSurface:
+    """Smooth the scan, take normals and build the search tree; vertices without faces are dropped.
+
+    Args:
+        smoothing_passes: Laplacian passes at half step; open edges stay where they are, so that nothing shrinks.
+    """
+    positions = np.ascontiguousarray(vertices, np.float64)
+    triangles = np.ascontiguousarray(faces, np.int32)
+    rim, used = open_vertices(triangles, len(positions))
+    for _ in range(smoothing_passes):
+        positions = laplacian_pass(positions, triangles, rim)
+    normals = vertex_normals_kernel(positions, triangles)
+    edge = positions[triangles[:, 0]] - positions[triangles[:, 1]]
+    spacing = float(np.sqrt((edge * edge).sum(axis=1)).mean())
+    if not used.all():
+        positions, normals, rim = positions[used], normals[used], rim[used]
+    tree = cKDTree(positions, balanced_tree=False, compact_nodes=False)
+    return ScanSurface(positions, normals, rim, tree, spacing)
+
+
+def mesh_normals(
+    vertices: Float64[np.ndarray, "verts 3"], faces: Integer[np.ndarray, "faces 3"]
+) -> Float64[np.ndarray, "verts 3"]:
+    """Area-weighted unit vertex normals in float64: `capture4d.mesh.vertex_normals` at a tenth of the time."""
+    return vertex_normals_kernel(np.ascontiguousarray(vertices, np.float64), faces)
+
+
+def match(
+    surface: ScanSurface,
+    points: Float64[np.ndarray, "queries 3"],
+    normals: Float64[np.ndarray, "queries 3"],
+    *,
+    gate: float,
+    min_normal_cosine: float,
+    robust_scale: float,
+) -> Matches:
+    """Nearest scan vertex of each point, gated in distance and normal, with Geman-McClure weights.
+
+    Args:
+        gate: largest distance, metres.
+        robust_scale: scale of the weight (1 + (d/s)^2)^-2 as a share of the gate, d measured along the scan's normal.
+    """
+    distances, indices = surface.tree.query(points, distance_upper_bound=gate)
+    found = indices < len(surface.points)
+    nearest = np.where(found, indices, 0)
+    target, target_normal = surface.points[nearest], surface.normals[nearest]
+    cosine = np.einsum("va,va->v", normals, target_normal)
+    off_plane = np.einsum("va,va->v", points - target, target_normal)
+    weights = 1.0 / (1.0 + (off_plane / (robust_scale * gate)) ** 2) ** 2
+    weights[~found | (cosine < min_normal_cosine)] = 0.0
+    return Matches(target, target_normal, weights, distances, indices)
+
+
+@njit(cache=True)
+def open_vertices(faces, count):
+    """Vertices on an open edge, and vertices that any face uses.
+
+    Around an inner vertex every neighbour is once the next and once the previous corner, so a sum of scrambled indices
+    with alternating sign vanishes; no edge list is needed.
+    """
+    balance = np.zeros(count, np.int64)
+    used = np.zeros(count, np.bool_)
+    for f in range(len(faces)):
+        for k in range(3):
+            vertex, onward, back = faces[f, k], faces[f, (k + 1) % 3], faces[f, (k + 2) % 3]
+            used[vertex] = True
+            a = np.int64(onward) * np.int64(2654435761)
+            b = np.int64(back) * np.int64(2654435761)
+            balance[vertex] += (a ^ (a >> 17)) - (b ^ (b >> 17))
+    return balance != 0, used
+
+
+@njit(cache=True)
+def laplacian_pass(positions, faces, fixed):
+    """Half a step towards the mean of the neighbours, each weighted by the faces it shares."""
+    total = np.zeros_like(positions)
+    weight = np.zeros(len(positions))
+    for f in range(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        for axis in range(3):
+            pa, pb, pc = positions[a, axis], positions[b, axis], positions[c, axis]
+            total[a, axis] += pb + pc
+            total[b, axis] += pc + pa
+            total[c, axis] += pa + pb
+        weight[a] += 2.0
+        weight[b] += 2.0
+        weight[c] += 2.0
+    result = positions.copy()
+    for v in range(len(positions)):
+        if weight[v] > 0.0 and not fixed[v]:
+            for axis in range(3):
+                result[v, axis] = 0.5 * (positions[v, axis] + total[v, axis] / weight[v])
+    return result
+
+
+@njit(cache=True)
+def vertex_normals_kernel(positions, faces):
+    """Area-weighted unit normals; zero where there is no area."""
+    result = np.zeros_like(positions)
+    for f in range(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        ux, uy, uz = (
+            positions[b, 0] - positions[a, 0],
+            positions[b, 1] - positions[a, 1],
+            positions[b, 2] - positions[a, 2],
+        )
+        wx, wy, wz = (
+            positions[c, 0] - positions[a, 0],
+            positions[c, 1] - positions[a, 1],
+            positions[c, 2] - positions[a, 2],
+        )
+        nx, ny, nz = uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx
+        for v in (a, b, c):
+            result[v, 0] += nx
+            result[v, 1] += ny
+            result[v, 2] += nz
+    for v in range(len(positions)):
+        length = np.sqrt(result[v, 0] ** 2 + result[v, 1] ** 2 + result[v, 2] ** 2)
+        if length > 0.0:
+            result[v, 0] /= length
+            result[v, 1] /= length
+            result[v, 2] /= length
+    return result

@@ -1,0 +1,226 @@
+"""One template on one scan: a coarse stage on the deformation graph, then a dense stage on every vertex.
+
+References: DeepWrinkles (ECCV 2018), section 3.1, Eq. 1-2; the dense stage and the annealing are ours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Float64
+
+from capture4d.errors import InputError
+from capture4d.types import GarmentScan
+from registration.boundary import BorderTargets, border_targets, tangent_free_metric
+from registration.config import BoundaryRule, RegistrationConfig, Schedule
+from registration.correspondences import ScanSurface, match, mesh_normals, prepare_scan
+from registration.deformation_graph import identity_nodes, rows_of_vertices, smooth_rows
+from registration.energies import edge_vectors, plane_metric, rigid_term, stretch_metric, tangential_metric
+from registration.solver import Rows, RowTerm, gauss_newton_step
+from registration.template import TemplateAnalysis
+
+__all__ = ["FrameRegistration", "FrameScan", "prepare_frame", "register_frame"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameScan:
+    """A garment scan ready for matching: surface, and painted points with the template's loop numbers."""
+
+    surface: ScanSurface
+    border_points: Float64[np.ndarray, "points 3"]
+    border_loops: np.ndarray
+    """(points,) int32: index of the template's loop, or -1 where the paint does not tell."""
+    frame_id: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameRegistration:
+    """The template on one scan."""
+
+    vertices: Float64[np.ndarray, "verts 3"]
+    """Metres, world frame."""
+    schedule: Literal["cold", "warm"]
+    linear_iterations: int
+    """Conjugate gradient iterations over all steps."""
+
+
+def prepare_frame(analysis: TemplateAnalysis, scan: GarmentScan, config: RegistrationConfig) -> FrameScan:
+    """Smooth the scan, take its normals, build the tree, thin its border points.
+
+    Raises:
+        InputError: the garment scan is empty.
+    """
+    if not len(scan.mesh.faces):
+        raise InputError(f"frame {scan.frame_id}: expected a garment scan with faces, found none")
+    surface = prepare_scan(scan.mesh.vertices, scan.mesh.faces, smoothing_passes=config.data.smoothing_passes)
+    stride = max(1, -(-len(scan.boundary_points) // config.boundary.max_points))
+    names = {name: index for index, name in enumerate(analysis.border.names)}
+    renumbered = np.array([names.get(name, -2) for name in scan.loop_names] + [-1], np.int32)
+    loops = renumbered[scan.boundary_loops[::stride]]
+    points = scan.boundary_points[::stride].astype(np.float64)
+    return FrameScan(surface, points[loops > -2], loops[loops > -2], scan.frame_id)
+
+
+def register_frame(
+    analysis: TemplateAnalysis,
+    scan: FrameScan,
+    initial_vertices: Float[np.ndarray, "verts 3"],
+    *,
+    config: RegistrationConfig,
+    schedule: Literal["cold", "warm"] = "cold",
+) -> FrameRegistration:
+    """Deform the template onto one scan by non-rigid ICP.
+
+    Args:
+        initial_vertices: start of the search, metres, world frame: the skinned template, or the predicted frame.
+        schedule: cold from a distant start, warm from the frame before.
+    Raises:
+        InputError: no scan vertex lies within the first gate of the start.
+    """
+    start = np.ascontiguousarray(initial_vertices, np.float64)
+    if start.shape != analysis.rest.shape or not np.isfinite(start).all():
+        raise InputError(
+            f"initial_vertices: expected {len(analysis.rest)} finite vertices of the template, found {start.shape}"
+        )
+    coarse = config.coarse.cold if schedule == "cold" else config.coarse.warm
+    dense = config.dense.cold if schedule == "cold" else config.dense.warm
+    vertices, first = _coarse_stage(analysis, scan, start, coarse, config)
+    vertices, second = _dense_stage(analysis, scan, start, vertices, dense, config)
+    return FrameRegistration(vertices, schedule, first + second)
+
+
+def _anneal(pair: tuple[float, float], step: int, steps: int) -> float:
+    """Geometric interpolation from first to last; linear if either end is 0."""
+    first, last = pair
+    share = step / max(steps - 1, 1)
+    if first > 0.0 and last > 0.0:
+        return first * (last / first) ** share
+    return first + (last - first) * share
+
+
+def _coarse_stage(
+    analysis: TemplateAnalysis, scan: FrameScan, start: np.ndarray, schedule: Schedule, config: RegistrationConfig
+) -> tuple[np.ndarray, int]:
+    if schedule.steps == 0:
+        return start, 0
+    graph, subset = analysis.graph, analysis.coarse_vertices
+    count = len(graph.nodes)
+    nodes = identity_nodes(count)
+    rows = rows_of_vertices(graph, start, np.arange(len(start)))
+    constant = start - rows.apply(nodes)
+    data_rows = rows_of_vertices(graph, start, subset)
+    border_rows = rows_of_vertices(graph, start, analysis.border.vertices)
+    node_rows, node_constant = smooth_rows(graph, start)
+    iterations = 0
+    vertices = start
+    for step in range(schedule.steps):
+        at = (step, schedule.steps)
+        normals = mesh_normals(vertices, analysis.faces)[subset]
+        terms = [_data_term(data_rows, scan.surface, vertices[subset], normals, _anneal(schedule.gate, *at), config)]
+        if step == 0 and not terms[0].metric.any():
+            raise InputError(
+                f"frame {scan.frame_id}: expected scan vertices within {schedule.gate[0]:g} m of the start, found none"
+            )
+        terms += _border_terms(
+            analysis, border_rows, scan, vertices, config.boundary.coarse_rule, False,
+            _anneal(schedule.boundary, *at), config,
+        )  # fmt: skip
+        smooth = _anneal(schedule.smooth, *at) / max(len(node_constant), 1)
+        metric = np.broadcast_to(smooth * np.eye(3), (len(node_constant), 3, 3))
+        terms.append(RowTerm(node_rows, np.ascontiguousarray(metric), node_rows.apply(nodes) + node_constant))
+        rigid = rigid_term(nodes, weight=_anneal(schedule.rigid, *at), spacing=graph.spacing)
+        change, used = gauss_newton_step(
+            terms, rigid, count, damping=1e-6,
+            tolerance=config.solver.tolerance, max_iterations=config.solver.max_iterations,
+        )  # fmt: skip
+        nodes = nodes + change
+        vertices = rows.apply(nodes) + constant
+        iterations += used
+    return vertices, iterations
+
+
+def _dense_stage(
+    analysis: TemplateAnalysis,
+    scan: FrameScan,
+    start: np.ndarray,
+    vertices: np.ndarray,
+    schedule: Schedule,
+    config: RegistrationConfig,
+) -> tuple[np.ndarray, int]:
+    count = len(vertices)
+    iterations = 0
+    border_rows = Rows(
+        np.arange(len(analysis.border.vertices) + 1, dtype=np.int32),
+        analysis.border.vertices,
+        np.ones((len(analysis.border.vertices), 1)),
+    )
+    reference = analysis.laplacian_rows.apply(vertices[:, :, None])
+    for step in range(schedule.steps):
+        at = (step, schedule.steps)
+        normals = mesh_normals(vertices, analysis.faces)
+        gate = _anneal(schedule.gate, *at)
+        terms = [_data_term(analysis.vertex_rows, scan.surface, vertices, normals, gate, config)]
+        terms += _border_terms(
+            analysis, border_rows, scan, vertices, config.boundary.dense_rule, config.boundary.along_curve,
+            _anneal(schedule.boundary, *at), config,
+        )  # fmt: skip
+        stretch, excess = stretch_metric(
+            edge_vectors(vertices, analysis.edges), analysis.rest_lengths,
+            weight=_anneal(schedule.stretch, *at), compression=config.dense.compression,
+        )  # fmt: skip
+        terms.append(RowTerm(analysis.edge_rows, stretch, excess))
+        bending = analysis.laplacian_rows.apply(vertices[:, :, None]) - reference
+        smooth = np.ascontiguousarray(
+            np.broadcast_to(_anneal(schedule.smooth, *at) / count * np.eye(3), (count, 3, 3))
+        )
+        terms.append(RowTerm(analysis.laplacian_rows, smooth, (1.0 - config.dense.plasticity) * bending))
+        anchor = _anneal(schedule.anchor, *at)
+        if anchor > 0.0:
+            weights = np.full(count, anchor / count)
+            terms.append(RowTerm(analysis.vertex_rows, tangential_metric(normals, weights), vertices - start))
+        change, used = gauss_newton_step(
+            terms, None, count, damping=1e-6,
+            tolerance=config.solver.tolerance, max_iterations=config.solver.max_iterations,
+        )  # fmt: skip
+        vertices = vertices + change[:, :, 0]
+        iterations += used
+    return vertices, iterations
+
+
+def _data_term(
+    rows: Rows, surface: ScanSurface, points: np.ndarray, normals: np.ndarray, gate: float, config: RegistrationConfig
+) -> RowTerm:
+    data = config.data
+    found = match(
+        surface, points, normals,
+        gate=gate, min_normal_cosine=data.min_normal_cosine, robust_scale=data.robust_scale,
+    )  # fmt: skip
+    metric = plane_metric(found.normals, found.weights / len(points), data.point_share)
+    return RowTerm(rows, metric, points - found.points)
+
+
+def _border_terms(
+    analysis: TemplateAnalysis,
+    rows: Rows,
+    scan: FrameScan,
+    vertices: np.ndarray,
+    rule: BoundaryRule,
+    along_curve: bool,
+    weight: float,
+    config: RegistrationConfig,
+) -> list[RowTerm]:
+    border = analysis.border
+    positions = vertices[border.vertices]
+    targets: BorderTargets = border_targets(
+        positions, border.loops, scan.border_points, scan.border_loops, rule=rule, gate=config.boundary.gate
+    )
+    if not targets.valid.any() or weight == 0.0:
+        return []
+    weights = np.where(targets.valid, weight / len(positions), 0.0)
+    if along_curve:
+        metric = tangent_free_metric(border.tangents(vertices), weights)
+    else:
+        metric = weights[:, None, None] * np.eye(3)
+    return [RowTerm(rows, metric, positions - targets.points)]

@@ -1,0 +1,139 @@
+"""What registration needs to know about a template, found once and used for every frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64, Int32
+
+from capture4d.errors import InputError
+from capture4d.mesh import unique_edges
+from capture4d.types import Garment
+from registration.config import RegistrationConfig
+from registration.deformation_graph import DeformationGraph, build_graph
+from registration.solver import Rows
+
+__all__ = ["Border", "TemplateAnalysis", "analyse_template"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Border:
+    """All border loops of a template, one after the other."""
+
+    vertices: Int32[np.ndarray, " border"]
+    before: Int32[np.ndarray, " border"]
+    """The vertex before each along its loop."""
+    after: Int32[np.ndarray, " border"]
+    loops: Int32[np.ndarray, " border"]
+    """Index into `names`."""
+    names: tuple[str, ...]
+
+    def tangents(self, positions: Float64[np.ndarray, "verts 3"]) -> Float64[np.ndarray, "border 3"]:
+        """Unit directions along the border."""
+        along = positions[self.after] - positions[self.before]
+        return along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TemplateAnalysis:
+    """Sparsity and weights of one template: many frames share it."""
+
+    garment: Garment
+    faces: Int32[np.ndarray, "faces 3"]
+    rest: Float64[np.ndarray, "verts 3"]
+    edges: Int32[np.ndarray, "edges 2"]
+    rest_lengths: Float64[np.ndarray, " edges"]
+    graph: DeformationGraph
+    coarse_vertices: Int32[np.ndarray, " subset"]
+    """Vertices that carry the coarse data term; border vertices are among them."""
+    border: Border
+    vertex_rows: Rows
+    """Vertices as they are."""
+    edge_rows: Rows
+    """Edge vectors."""
+    laplacian_rows: Rows
+    """Each vertex minus the mean of its neighbours; along the border, of its neighbours on the border."""
+
+
+def analyse_template(garment: Garment, config: RegistrationConfig) -> TemplateAnalysis:
+    """Deformation graph, coarse vertices, borders and difference operators of a template.
+
+    Raises:
+        InputError: the template has no faces.
+    """
+    faces = garment.template.faces
+    if not len(faces):
+        raise InputError("template: expected at least one face, found none")
+    rest = garment.template.vertices.astype(np.float64)
+    graph = build_graph(
+        rest, faces, nodes=config.graph.nodes, nodes_per_vertex=config.graph.nodes_per_vertex
+    )
+    border = _border(garment)
+    edges = unique_edges(faces)
+    lengths = np.linalg.norm(rest[edges[:, 1]] - rest[edges[:, 0]], axis=1)
+    return TemplateAnalysis(
+        garment=garment,
+        faces=faces,
+        rest=rest,
+        edges=edges,
+        rest_lengths=lengths,
+        graph=graph,
+        coarse_vertices=_coarse_vertices(len(rest), config.graph.vertices, border, faces),
+        border=border,
+        vertex_rows=_rows([np.arange(len(rest))], [1.0]),
+        edge_rows=_rows([edges[:, 0], edges[:, 1]], [-1.0, 1.0]),
+        laplacian_rows=_laplacian_rows(edges, faces, len(rest)),
+    )
+
+
+def _border(garment: Garment) -> Border:
+    names = tuple(garment.loops)
+    loops = list(garment.loops.values())
+    empty = np.zeros(0, np.int32)
+    return Border(
+        vertices=np.concatenate([empty, *loops]),
+        before=np.concatenate([empty, *(np.roll(loop, 1) for loop in loops)]),
+        after=np.concatenate([empty, *(np.roll(loop, -1) for loop in loops)]),
+        loops=np.concatenate([empty, *(np.full(len(loop), i, np.int32) for i, loop in enumerate(loops))]),
+        names=names,
+    )
+
+
+def _coarse_vertices(count: int, wanted: int, border: Border, faces: np.ndarray) -> np.ndarray:
+    """A fixed random subset of the vertices in use, and all border vertices."""
+    used = np.unique(faces)
+    if 0 < wanted < len(used):
+        used = np.random.default_rng(0).choice(used, wanted, replace=False)
+    return np.union1d(used, border.vertices).astype(np.int32)
+
+
+def _rows(columns: list[np.ndarray], signs: list[float]) -> Rows:
+    entries = np.column_stack(columns).astype(np.int32)
+    width = len(columns)
+    coefficients = np.tile(np.array(signs), len(entries))[:, None]
+    return Rows(np.arange(0, entries.size + 1, width, dtype=np.int32), entries.reshape(-1), coefficients)
+
+
+def _laplacian_rows(edges: np.ndarray, faces: np.ndarray, count: int) -> Rows:
+    corners = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    keys = np.sort(corners, axis=1).astype(np.int64) @ np.array([1 << 32, 1])
+    unique, uses = np.unique(keys, return_counts=True)
+    on_border = uses == 1
+    border_vertex = np.zeros(count, bool)
+    border_vertex[edges[on_border].reshape(-1)] = True
+    both = np.concatenate([edges, edges[:, ::-1]])
+    on_border = np.concatenate([on_border, on_border])
+    both = both[~border_vertex[both[:, 0]] | on_border]
+    both = both[np.lexsort((both[:, 1], both[:, 0]))]
+    degree = np.bincount(both[:, 0], minlength=count)
+    offsets = np.concatenate([[0], np.cumsum(degree + (degree > 0))]).astype(np.int32)
+    columns = np.empty(offsets[-1], np.int32)
+    coefficients = np.empty((offsets[-1], 1))
+    own = offsets[:-1][degree > 0]
+    columns[own], coefficients[own] = np.flatnonzero(degree > 0), 1.0
+    others = np.ones(offsets[-1], bool)
+    others[own] = False
+    columns[others] = both[:, 1]
+    coefficients[others, 0] = -1.0 / degree[both[:, 0]]
+    return Rows(offsets, columns, coefficients)
