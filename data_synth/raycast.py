@@ -1,0 +1,136 @@
+"""True depth, angle, colour and surface images of a camera, by ray casting."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8
+
+from capture4d.mesh import vertex_normals
+from capture4d.open3d_loading import import_open3d
+from capture4d.types import Mesh, Rig
+
+__all__ = ["CameraImages", "NOTHING", "Surface", "SurfaceScene"]
+
+NOTHING = 255
+"""In a surface image: no surface."""
+TILE = 8
+"""Rays are cast in square tiles of pixels; one probe ray per tile decides whether it is worth it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surface:
+    """One thing the scanner sees."""
+
+    mesh: Mesh
+    colours: UInt8[np.ndarray, "verts 3"]
+    """sRGB per vertex; a painted border is the colour of its vertices."""
+    label: int
+    """0 body, 1 garment."""
+    voxel_m: float
+    """Edge of the voxels it is fused in."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraImages:
+    """What one camera would see with perfect sensors, on a window of its image."""
+
+    depth: Float32[np.ndarray, "h w"]
+    """Metres along the camera's z axis, 0 where there is nothing."""
+    cosine: Float32[np.ndarray, "h w"]
+    """Of the angle between the ray and the surface; negative where the back of the surface is seen."""
+    surface: UInt8[np.ndarray, "h w"]
+    """Index of the surface, NOTHING where there is none."""
+    colours: Float32[np.ndarray, "h w 3"]
+    """0 to 1, lit."""
+    origin: tuple[int, int]
+    """Row and column of the window's first pixel in the whole image."""
+
+
+class SurfaceScene:
+    """Surfaces, lit and ready to be seen from many cameras."""
+
+    def __init__(self, surfaces: Sequence[Surface], *, ambient: float = 1.0) -> None:
+        geometry = import_open3d().t.geometry
+        self._scene = geometry.RaycastingScene(nthreads=1)
+        self._first_face = np.cumsum([0, *(len(s.mesh.faces) for s in surfaces)])
+        for surface in surfaces:
+            self._scene.add_triangles(_tensor(surface.mesh.vertices), _tensor(surface.mesh.faces.astype(np.uint32)))
+        corner_colours = [light(s, ambient=ambient)[s.mesh.faces] for s in surfaces]
+        self._corner_colours = np.concatenate(corner_colours)  # (F, 3 corners, 3)
+
+    def view(self, rig: Rig, camera: int) -> CameraImages | None:
+        """The images of one camera, or None where it sees nothing."""
+        width, height = (int(size) for size in rig.image_sizes[camera])
+        tiles = self._occupied_tiles(rig, camera, width, height)
+        rows, columns = np.nonzero(tiles)
+        if not len(rows):
+            return None
+        top, left = rows.min() * TILE, columns.min() * TILE
+        shape = (rows.max() + 1) * TILE - top, (columns.max() + 1) * TILE - left
+        within = np.arange(TILE)
+        v = np.broadcast_to((rows[:, None, None] * TILE + within[:, None]), (len(rows), TILE, TILE)).ravel()
+        u = np.broadcast_to((columns[:, None, None] * TILE + within), (len(rows), TILE, TILE)).ravel()
+        rays = _rays(rig, camera, u.astype(np.float32), v.astype(np.float32))
+        answer = self._scene.cast_rays(_tensor(rays), nthreads=1)
+        t_hit = answer["t_hit"].numpy()
+        hit = np.flatnonzero(np.isfinite(t_hit))
+        pixel = (v[hit] - top) * shape[1] + (u[hit] - left)
+        surface = answer["geometry_ids"].numpy()[hit]
+        face = answer["primitive_ids"].numpy()[hit] + self._first_face[surface]
+        corners = self._corner_colours[face]
+        second, third = answer["primitive_uvs"].numpy()[hit].T[:, :, None]
+        colours = corners[:, 0] + second * (corners[:, 1] - corners[:, 0]) + third * (corners[:, 2] - corners[:, 0])
+        directions = rays[hit, 3:]
+        normals = answer["primitive_normals"].numpy()[hit]
+        cosine = -np.einsum("ij,ij->i", directions, normals) / np.linalg.norm(directions, axis=1)
+        return CameraImages(
+            depth=_image(shape, pixel, t_hit[hit]),
+            cosine=_image(shape, pixel, cosine),
+            surface=_image(shape, pixel, surface.astype(np.uint8), fill=NOTHING),
+            colours=_image(shape, pixel, colours),
+            origin=(int(top), int(left)),
+        )
+
+    def _occupied_tiles(self, rig: Rig, camera: int, width: int, height: int) -> Bool[np.ndarray, "rows columns"]:
+        """Tiles whose centre, or a neighbour's, hits something."""
+        columns, rows = -(-width // TILE), -(-height // TILE)
+        v, u = (index.ravel() * TILE + TILE // 2 for index in np.indices((rows, columns)))
+        probes = self._scene.test_occlusions(_tensor(_rays(rig, camera, u, v)), nthreads=1).numpy()
+        tiles = np.pad(probes.reshape(rows, columns), 1)
+        tiles = tiles[:-2] | tiles[1:-1] | tiles[2:]
+        return tiles[:, :-2] | tiles[:, 1:-1] | tiles[:, 2:]
+
+
+def light(surface: Surface, *, ambient: float) -> Float32[np.ndarray, "verts 3"]:
+    """Vertex colours, 0 to 1, under an even light and two weak lamps, front left and back right of the subject."""
+    normals = vertex_normals(surface.mesh.vertices, surface.mesh.faces)
+    key = np.array([0.45, 0.6, 0.66], np.float32)
+    fill = np.array([-0.6, 0.2, -0.77], np.float32)
+    lamps = 0.75 * np.clip(normals @ key, 0, None) + 0.45 * np.clip(normals @ fill, 0, None)
+    shade = ambient + (1 - ambient) * 1.5 * lamps
+    return (surface.colours.astype(np.float32) / 255 * shade[:, None]).astype(np.float32)
+
+
+def _rays(rig: Rig, camera: int, u: np.ndarray, v: np.ndarray) -> Float32[np.ndarray, "rays 6"]:
+    """Rays through pixels (u, v); a direction reaches depth 1, so that the hit distance is the depth."""
+    K, T = rig.intrinsics[camera], rig.T_camera_world[camera]
+    to_world = np.linalg.inv(K @ T[:3, :3]).astype(np.float32)
+    rays = np.empty((len(u), 6), np.float32)
+    rays[:, :3] = -T[:3, :3].T @ T[:3, 3]
+    for axis in range(3):
+        rays[:, 3 + axis] = u * to_world[axis, 0] + v * to_world[axis, 1] + to_world[axis, 2]
+    return rays
+
+
+def _image(shape: tuple[int, int], pixel: np.ndarray, values: np.ndarray, fill: int = 0) -> np.ndarray:
+    image = np.full((shape[0] * shape[1], *values.shape[1:]), fill, values.dtype)
+    image[pixel] = values
+    return image.reshape(*shape, *values.shape[1:])
+
+
+def _tensor(array: np.ndarray) -> Any:
+    return import_open3d().core.Tensor.from_numpy(np.ascontiguousarray(array))

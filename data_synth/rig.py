@@ -1,0 +1,92 @@
+"""Camera rigs of a 4D capture stage: three rings around the subject, a few cameras above and below."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float64
+
+from capture4d.errors import InputError
+from capture4d.types import Rig
+
+__all__ = ["bounding_sphere", "capture_rig", "look_at"]
+
+# (name, share of the cameras, distance from the axis, height, height looked at); lengths in radii of the subject, and
+# heights from its centre. At a radius of 0.55 m (a shirt over a range of motion) the cameras stand 1.5 m away, as in
+# the measured set-up; the low ring looks down at the legs and the upper one up at the head, as a lab's does.
+RINGS: tuple[tuple[str, float, float, float, float], ...] = (
+    ("low", 0.25, 2.75, -1.45, -0.35),
+    ("middle", 0.35, 2.75, 0.0, 0.0),
+    ("upper", 0.25, 2.60, 1.45, 0.20),
+    ("top", 0.10, 1.70, 2.50, 0.0),
+    ("floor", 0.05, 2.20, -1.70, 0.0),
+)
+
+
+def look_at(eye: Sequence[float] | np.ndarray, target: Sequence[float] | np.ndarray) -> Float64[np.ndarray, "4 4"]:
+    """T_camera_world of a camera at `eye` with its z axis towards `target` and world Y up in the image (image y down)."""
+    eye, target = np.asarray(eye, float), np.asarray(target, float)
+    forward = target - eye
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, (0.0, 1.0, 0.0))
+    right /= np.linalg.norm(right)
+    transform = np.eye(4)
+    transform[:3, :3] = right, np.cross(forward, right), forward
+    transform[:3, 3] = -transform[:3, :3] @ eye
+    return transform
+
+
+def bounding_sphere(points: np.ndarray) -> tuple[np.ndarray, float]:
+    """Centre (3,) of the bounding box of points (..., 3) and the radius, metres, of the sphere about it."""
+    points = np.asarray(points, float).reshape(-1, 3)
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    return centre, float(np.linalg.norm(points - centre, axis=1).max())
+
+
+def capture_rig(
+    *,
+    centre: Sequence[float] | np.ndarray = (0.0, 1.2, 0.0),
+    radius: float = 0.55,
+    cameras: int = 48,
+    image_size: int = 512,
+    field_of_view_deg: float = 48.0,
+) -> Rig:
+    """Cameras in rings around a subject, all sharp, undistorted and equal.
+
+    Args:
+        centre, radius: sphere around what is to be captured, metres; `bounding_sphere` finds it. The default is the
+            upper body of a standing adult.
+        image_size: width and height, pixels.
+    """
+    if cameras < 4:
+        raise InputError(f"cameras: expected at least 4, found {cameras}")
+    if not radius > 0:
+        raise InputError(f"radius: expected a positive length in metres, found {radius}")
+    centre = np.asarray(centre, float)
+    names, transforms = [], []
+    for index, (ring, count) in enumerate(zip(RINGS, _ring_counts(cameras), strict=True)):
+        name, _, distance, height, aim = ring
+        azimuths = 2 * np.pi * (np.arange(count) / max(count, 1) + 0.381966 * index)
+        for number, azimuth in enumerate(azimuths):
+            offset = np.array([distance * np.sin(azimuth), height, distance * np.cos(azimuth)])
+            transforms.append(look_at(centre + radius * offset, centre + (0.0, radius * aim, 0.0)))
+            names.append(f"{name}{number:02d}")
+    focal = image_size / 2 / np.tan(np.radians(field_of_view_deg) / 2)
+    middle = (image_size - 1) / 2
+    intrinsics = np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1]])
+    return Rig(
+        names=tuple(names),
+        intrinsics=np.tile(intrinsics, (cameras, 1, 1)),
+        distortion=np.zeros((cameras, 5)),
+        T_camera_world=np.stack(transforms),
+        image_sizes=np.full((cameras, 2), image_size, np.int32),
+    )
+
+
+def _ring_counts(cameras: int) -> list[int]:
+    """Whole cameras per ring, by largest remainder."""
+    exact = np.array([share * cameras for _, share, *_ in RINGS])
+    counts = np.floor(exact).astype(int)
+    counts[np.argsort(counts - exact, kind="stable")[: cameras - counts.sum()]] += 1
+    return counts.tolist()

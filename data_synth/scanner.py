@@ -1,0 +1,101 @@
+"""The virtual 4D scanner: surfaces in, one noisy, holey, coloured mesh out, as a capture stage would deliver it.
+
+Every camera sees depth and colour by ray casting (`raycast`), its sensor adds correlated noise and loses pixels
+(`depth_noise`), and the images are fused into a mesh (`fusion`). Holes are not drawn: they are where fewer than two
+cameras see the surface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import UInt8
+from scipy.spatial import cKDTree
+
+from capture4d.errors import InputError
+from capture4d.mesh import face_areas
+from capture4d.types import Mesh, Rig, Scan
+from data_synth.depth_noise import corrupt_depth, draw_noise_fields
+from data_synth.fusion import DepthFusion
+from data_synth.raycast import Surface, SurfaceScene
+from data_synth.scanner_config import ScannerConfig
+
+__all__ = ["LABEL_BODY", "LABEL_BORDER", "LABEL_GARMENT", "Surface", "scan_surfaces"]
+
+LABEL_BODY, LABEL_GARMENT, LABEL_BORDER = 0, 1, 2
+
+
+def scan_surfaces(
+    rig: Rig,
+    surfaces: Sequence[Surface],
+    *,
+    config: ScannerConfig,
+    rng: np.random.Generator,
+    frame_id: int = 0,
+    time_s: float = 0.0,
+) -> tuple[Scan, UInt8[np.ndarray, " verts"]]:
+    """Scan surfaces from every camera of a rig.
+
+    A surface may be an open sheet: its two sides are then fused apart, so that the inside of a sleeve is scanned
+    without disturbing its outside.
+
+    Args:
+        rng: the only source of randomness; the same state gives the same arrays, on any number of threads.
+
+    Returns:
+        The scan, and the true label of each of its vertices: 0 body, 1 garment, 2 painted border of the garment.
+    """
+    if np.any(rig.distortion):
+        raise InputError("rig.distortion: the scanner needs undistorted cameras, found non-zero coefficients")
+    if not surfaces:
+        raise InputError("surfaces: expected at least one, found none")
+    scene = SurfaceScene(surfaces, ambient=config.shading.ambient)
+    fields = draw_noise_fields(config.noise, rng, largest_image=int(rig.image_sizes.max()))
+    areas = [float(face_areas(s.mesh.vertices, s.mesh.faces).sum()) for s in surfaces]
+    volumes = [
+        (DepthFusion(s.voxel_m, area, config=config.fusion), DepthFusion(s.voxel_m, 0.1 * area, config=config.fusion))
+        for s, area in zip(surfaces, areas, strict=True)
+    ]
+    for camera in range(len(rig.names)):
+        images = scene.view(rig, camera)
+        if images is None:
+            continue
+        depth = corrupt_depth(images.depth, np.abs(images.cosine), fields, config=config.noise, rng=rng)
+        colours = images.colours * np.float32(1 + config.shading.camera_gain * rng.standard_normal())
+        colours += np.float32(config.shading.pixel_noise) * fields.window(fields.colour, depth.shape, rng)
+        K = rig.intrinsics[camera].copy()
+        K[:2, 2] -= images.origin[::-1]
+        for index, sides in enumerate(volumes):
+            for volume, visible in zip(sides, (images.cosine > 0, images.cosine < 0), strict=True):
+                here = visible & (images.surface == index)
+                volume.add(np.where(here, depth, np.float32(0)), colours, K, rig.T_camera_world[camera])
+    return _merge(surfaces, volumes, frame_id, time_s)
+
+
+def _merge(
+    surfaces: Sequence[Surface], volumes: Sequence[Sequence[DepthFusion]], frame_id: int, time_s: float
+) -> tuple[Scan, UInt8[np.ndarray, " verts"]]:
+    vertices, faces, colours, labels, count = [], [], [], [], 0
+    for surface, sides in zip(surfaces, volumes, strict=True):
+        for volume in sides:
+            mesh, colour = volume.extract()
+            vertices.append(mesh.vertices)
+            faces.append(mesh.faces + np.int32(count))
+            colours.append(colour)
+            labels.append(_labels(surface, mesh.vertices))
+            count += len(mesh.vertices)
+    mesh = Mesh(np.concatenate(vertices), np.concatenate(faces))
+    return Scan(mesh, np.concatenate(colours), frame_id, time_s), np.concatenate(labels)
+
+
+def _labels(surface: Surface, points: np.ndarray) -> UInt8[np.ndarray, " points"]:
+    """Body, garment, or border where the nearest vertex of the garment has another colour than most of it."""
+    if surface.label != LABEL_GARMENT:
+        return np.full(len(points), surface.label, np.uint8)
+    code = surface.colours.astype(np.int32) @ np.array([1 << 16, 1 << 8, 1], np.int32)
+    painted = code != np.bincount(code).argmax()
+    if not painted.any() or not len(points):
+        return np.full(len(points), LABEL_GARMENT, np.uint8)
+    _, nearest = cKDTree(surface.mesh.vertices).query(points, workers=1)
+    return np.where(painted[nearest], LABEL_BORDER, LABEL_GARMENT).astype(np.uint8)

@@ -1,0 +1,87 @@
+"""Settings of the virtual 4D scanner: the rig, the sensor's noise, the fusion.
+
+The defaults come from measurements on a simulated T-shirt (see docs/scanner.md for the figures and the command that
+prints them). Lengths are metres unless the name says otherwise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+__all__ = ["FusionConfig", "NoiseConfig", "RigConfig", "ScannerConfig", "ShadingConfig"]
+
+
+@dataclass(frozen=True, slots=True)
+class RigConfig:
+    """Where the cameras stand."""
+
+    cameras: int = 48
+    """How many; 20 to 48 are sensible."""
+    image_size: int = 512
+    """Width and height of the square images, pixels."""
+    field_of_view_deg: float = 48.0
+    """Full horizontal angle of view."""
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseConfig:
+    """What the depth sensor does to the true depth."""
+
+    sigma_m: float = 0.0003
+    """Standard deviation of the depth at `reference_depth_m`, seen head-on. It grows with the square of the depth."""
+    reference_depth_m: float = 1.5
+    """Depth at which `sigma_m` holds."""
+    correlation_px: float = 2.0
+    """Width of the Gaussian that correlates neighbouring pixels, as stereo matching windows do."""
+    grazing_floor: float = 0.25
+    """Noise grows with 1/cos of the angle to the surface normal, down to this cosine."""
+    silhouette_step_m: float = 0.012
+    """A larger step of depth between neighbouring pixels is a silhouette: both sides are lost."""
+    lost_cosine: float = 0.2
+    """Surfaces seen flatter than this cosine are lost."""
+    weak_cosine: float = 0.35
+    """Surfaces seen flatter than this cosine are lost in blobs."""
+    weak_loss: float = 0.38
+    """Share of the weakly seen surface that is lost."""
+    blob_loss: float = 0.01
+    """Share of any surface that is lost in blobs."""
+    blob_px: float = 5.0
+    """Size of the blobs."""
+
+
+@dataclass(frozen=True, slots=True)
+class ShadingConfig:
+    """What light and lens do to the colours."""
+
+    ambient: float = 0.72
+    """Share of the light that comes from everywhere; the rest comes from two lamps."""
+    camera_gain: float = 0.03
+    """Standard deviation of each camera's exposure."""
+    pixel_noise: float = 0.015
+    """Standard deviation of a pixel's colour, 1 = full scale."""
+
+
+@dataclass(frozen=True, slots=True)
+class FusionConfig:
+    """Fusion of the depth images by truncated signed distances, and the cleaning of the result."""
+
+    garment_voxel_m: float = 0.003
+    body_voxel_m: float = 0.006
+    truncation_voxels: float = 3.0
+    """Open3D's default of 8 lets both sides of a sleeve interfere: four times the error."""
+    min_weight: float = 2.0
+    """Cameras that must have seen a voxel."""
+    block_resolution: int = 8
+    """Voxels along the edge of a block of the sparse grid."""
+    min_component_faces: int = 400
+    """Smaller connected pieces are dropped."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScannerConfig:
+    """The virtual 4D scanner."""
+
+    rig: RigConfig = field(default_factory=RigConfig)
+    noise: NoiseConfig = field(default_factory=NoiseConfig)
+    shading: ShadingConfig = field(default_factory=ShadingConfig)
+    fusion: FusionConfig = field(default_factory=FusionConfig)
