@@ -192,17 +192,17 @@ def _obj_index(text: str, count: int) -> int:
 def _obj_bytes(mesh: Mesh, colours: np.ndarray | None, polygon_sizes: np.ndarray | None) -> bytes:
     # 9 significant digits give a float32 back exactly.
     if colours is None:
-        lines = ["v %.9g %.9g %.9g" % (x, y, z) for x, y, z in mesh.vertices.tolist()]
+        lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.vertices.tolist()]
     else:
         rows = zip(mesh.vertices.tolist(), (colours / 255.0).tolist(), strict=True)
-        lines = ["v %.9g %.9g %.9g %.6f %.6f %.6f" % (*point, *colour) for point, colour in rows]
+        lines = [f"v {x:.9g} {y:.9g} {z:.9g} {r:.6f} {g:.6f} {b:.6f}" for (x, y, z), (r, g, b) in rows]
 
     sizes = np.full(len(mesh.faces), 3) if polygon_sizes is None else polygon_sizes
     triangle, corner = _polygon_corners(sizes)
     tokens = [str(index + 1) for index in mesh.faces[triangle, corner].tolist()]
     if mesh.uv is not None:
         points, texture = np.unique(mesh.uv[triangle, corner], axis=0, return_inverse=True)
-        lines += ["vt %.9g %.9g" % (u, v) for u, v in points.tolist()]
+        lines += [f"vt {u:.9g} {v:.9g}" for u, v in points.tolist()]
         tokens = [f"{token}/{index + 1}" for token, index in zip(tokens, texture.reshape(-1).tolist(), strict=True)]
     rest = iter(tokens)
     lines += ["f " + " ".join(itertools.islice(rest, size)) for size in sizes.tolist()]

@@ -18,7 +18,6 @@ import shutil
 import signal
 import tempfile
 import threading
-import time
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed

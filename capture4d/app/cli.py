@@ -1,0 +1,254 @@
+"""The `capture4d` command: one subcommand per stage, and `run` for all of them.
+
+Bad input ends in one line on stderr and exit code 1, a broken limit in exit code 1, a wrong command line in 2, Ctrl-C
+in 130; anything else is a bug and keeps its traceback.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import errno
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal, NoReturn
+
+import tyro
+from tyro.conf import Positional, UseAppendAction, arg
+
+from capture4d.errors import InputError
+from registration import config as registration_config
+from registration.config import RegistrationConfig
+
+# What a user's disk can answer; the message names the path, and a traceback would add nothing.
+_DISK_ANSWERS = {
+    errno.EACCES,
+    errno.EDQUOT,
+    errno.EISDIR,
+    errno.ENOENT,
+    errno.ENOSPC,
+    errno.ENOTDIR,
+    errno.EPERM,
+    errno.EROFS,
+}
+
+
+def _all_cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Stage:
+    workers: int = field(default_factory=_all_cores)
+    """Processes to use; the result does not depend on it."""
+    overwrite: bool = False
+    """Start clean: delete what an earlier run left in the output folder."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demo(_Stage):
+    """Make a synthetic capture, register it, and report: the whole pipeline in minutes."""
+
+    output: Path = Path("out")
+    """Folder for everything, the capture included."""
+
+    def __call__(self) -> int:
+        from capture4d.app.pipeline import run_demo
+
+        print(f"report: {run_demo(self.output, workers=self.workers, overwrite=self.overwrite)}")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Register(_Stage):
+    """Register the template to every frame whose garment `extract` has cut out."""
+
+    capture: Positional[Path]
+    """Capture folder."""
+    output: Path
+    """Work folder; holds garment/ and gets registration/."""
+    preset: Literal["default", "paper"] = "default"
+    """What the settings below start from; `paper` is DeepWrinkles as printed."""
+    config: Annotated[RegistrationConfig, arg(name="")] = field(default_factory=RegistrationConfig)
+
+    def __call__(self) -> int:
+        from registration.stage import run
+
+        run(
+            self.capture,
+            self.output / "garment",
+            self.output / "registration",
+            self.config,
+            workers=self.workers,
+            overwrite=self.overwrite,
+        )
+        print(f"registration: {self.output / 'registration'}")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run(_Stage):
+    """Run every stage on a capture: extract, register, report."""
+
+    capture: Positional[Path]
+    """Capture folder."""
+    output: Path
+    """Work folder."""
+    preset: Literal["default", "paper"] = "default"
+    """What the settings of the registration start from; `paper` is DeepWrinkles as printed."""
+    config: Annotated[RegistrationConfig, arg(name="registration")] = field(default_factory=RegistrationConfig)
+
+    def __call__(self) -> int:
+        from capture4d.app.pipeline import run_all
+
+        report = run_all(self.capture, self.output, self.config, workers=self.workers, overwrite=self.overwrite)
+        print(f"report: {report}")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """Draw the report of a registered capture, and check its metrics against limits."""
+
+    work: Positional[Path]
+    """Work folder; holds registration/ and gets report/."""
+    fail_above: UseAppendAction[tuple[Annotated[str, arg(metavar="METRIC=LIMIT")], ...]] = ()
+    """Exit with 1 if this metric of report/metrics.json is above the limit; may be given several times."""
+
+    def __call__(self) -> int:
+        from capture4d.app.pipeline import broken_limits, parse_limits, run_report
+
+        limits = parse_limits(self.fail_above)
+        print(f"report: {run_report(self.work)}")
+        broken = broken_limits(self.work, limits)
+        for line in broken:
+            print(f"capture4d: {line}", file=sys.stderr)
+        return 1 if broken else 0
+
+
+@dataclass(frozen=True)
+class ConvertBody:
+    """Convert a body model of the SMPL family, from your own licensed file, to a body.npz for captures."""
+
+    file: Positional[Path]
+    """SMPL, SMPL-H or SMPL-X model, .npz, or .pkl (read without running its code)."""
+    output: Path
+    """File to write, as body.npz in a capture folder."""
+
+    def __call__(self) -> int:
+        from capture4d.body import convert_smpl
+        from capture4d.scans import save_body
+
+        save_body(self.output, convert_smpl(self.file))
+        print(f"body: {self.output}")
+        return 0
+
+
+_COMMANDS: Mapping[str, Any] = {
+    "demo": Demo,
+    "register": Register,
+    "run": Run,
+    "report": Report,
+    "convert-body": ConvertBody,
+}
+
+_PRESETS: Mapping[Any, Mapping[str, Any]] = {
+    Register: registration_config.PRESETS,
+    Run: registration_config.PRESETS,
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> NoReturn:
+    """Run one command and exit with its code."""
+    # One thread per process: frames run in parallel as processes, results do not depend on the machine, and CPU time
+    # is what the work costs. Numerical libraries read these as they load, which is later.
+    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")
+    sys.exit(_run(list(sys.argv[1:] if arguments is None else arguments)))
+
+
+def _run(arguments: list[str]) -> int:
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(_overview())
+        return 0 if arguments else 2
+    if arguments[0] == "--version":
+        from importlib.metadata import version
+
+        print(f"capture4d {version('capture4d')}")
+        return 0
+    name, *rest = arguments
+    if name not in _COMMANDS:
+        near = difflib.get_close_matches(name, _COMMANDS, n=1)
+        hint = f"; did you mean '{near[0]}'?" if near else ""
+        return _complain(f"unknown command '{name}'{hint} (see capture4d --help)", code=2)
+    try:
+        return _parse(name, rest)()
+    except InputError as error:
+        return _complain(str(error))
+    except BrokenPipeError:  # whoever read our output, such as `head`, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except OSError as error:
+        if error.errno not in _DISK_ANSWERS or (error.filename is None and error.errno != errno.ENOSPC):
+            raise
+        kept = "; finished frames are kept, the same command goes on" if error.errno == errno.ENOSPC else ""
+        return _complain(f"{error.filename or 'output'}: {error.strerror}{kept}")
+    except RuntimeError as error:
+        from capture4d.workdir import WorkerDied
+
+        if not isinstance(error, WorkerDied):
+            raise
+        return _complain(str(error))
+    except KeyboardInterrupt:
+        _complain("interrupted; finished frames are kept, the same command goes on")
+        sys.stdout.flush()
+        os._exit(130)  # a plain exit would wait for the workers; these end with their parent
+
+
+def _parse(name: str, arguments: list[str]) -> Any:
+    """The command with its options. A --preset decides what the other settings start from."""
+    command = _COMMANDS[name]
+    presets = _PRESETS.get(command)
+    default = None
+    if presets:
+        given = _value_of("--preset", arguments)
+        if given in presets:
+            required = {
+                entry.name: tyro.MISSING
+                for entry in dataclasses.fields(command)
+                if entry.default is entry.default_factory is dataclasses.MISSING
+            }
+            default = command(**required, preset=given, config=presets[given])
+    return tyro.cli(command, prog=f"capture4d {name}", args=arguments, default=default)
+
+
+def _value_of(option: str, arguments: list[str]) -> str | None:
+    for index, argument in enumerate(arguments):
+        if argument == option:
+            return next(iter(arguments[index + 1 :]), None)
+        if argument.startswith(f"{option}="):
+            return argument.partition("=")[2]
+    return None
+
+
+def _overview() -> str:
+    lines = [f"  {name:<15}{(command.__doc__ or '').splitlines()[0]}" for name, command in _COMMANDS.items()]
+    return "\n".join(
+        [
+            "usage: capture4d COMMAND ...",
+            "",
+            "4D garment capture: non-rigid registration of coloured scans, and a synthetic 4D scanner.",
+            "",
+            *lines,
+            "",
+            "capture4d COMMAND --help lists a command's options. Every command resumes where it was stopped.",
+        ]
+    )
+
+
+def _complain(message: str, *, code: int = 1) -> int:
+    print(f"capture4d: {' '.join(message.splitlines())}", file=sys.stderr)
+    return code
