@@ -61,6 +61,12 @@ class LinearSolverConfig:
 class DataConfig:
     """Which scan points a template vertex may be pulled to."""
 
+    rule: Literal["plane", "both_ways"] = "plane"
+    """plane: each vertex to the plane at its nearest scan point; both_ways: the scan's points vote as well."""
+    max_voters: int = 20000
+    """Scan points that vote under both_ways."""
+    normal_length: float = 0.002
+    """What a normal turned by 60 degrees counts as among distances under both_ways, metres."""
     min_normal_cosine: float = 0.4
     """Reject a match whose normals differ by more than this angle's cosine."""
     robust_scale: float = 0.4

@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int, Integer
 from numba import njit
+from scipy import sparse
 from scipy.spatial import cKDTree
 
-__all__ = ["Matches", "ScanSurface", "match", "mesh_normals", "prepare_scan"]
+__all__ = ["Matches", "ScanSurface", "match", "match_both_ways", "mesh_normals", "prepare_scan"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,6 +100,55 @@ def match(
     weights = 1.0 / (1.0 + (off_plane / (robust_scale * gate)) ** 2) ** 2
     weights[~found | (cosine < min_normal_cosine)] = 0.0
     return Matches(target, target_normal, weights, distances, indices)
+
+
+def match_both_ways(
+    surface: ScanSurface,
+    points: Float64[np.ndarray, "queries 3"],
+    normals: Float64[np.ndarray, "queries 3"],
+    *,
+    gate: float,
+    min_normal_cosine: float,
+    robust_scale: float,
+    neighbours: int,
+    max_points: int,
+    normal_length: float,
+) -> Matches:
+    """Soft matches that the scan has a say in: each point's nearest scan points and the points nearest to each scan point.
+
+    Both lists of nearest neighbours, in position and normal, are weighed by inverse squared distance, made to sum to
+    one per voter, and added; the matched plane is their weighted mean. Scan that sticks out beyond the template's edge
+    pulls that edge outwards, which one-way matching never does.
+
+    Args:
+        neighbours: nearest neighbours either way.
+        max_points: the scan is thinned to this many voters.
+        normal_length: distance that a normal turned by 60 degrees counts as, metres.
+    References: MeshMonk (White et al. 2019), symmetric weighted correspondences.
+    """
+    stride = max(1, -(-len(surface.points) // max_points))
+    voters = np.arange(0, len(surface.points), stride)
+    scan_features = np.concatenate([surface.points[voters], normal_length * surface.normals[voters]], axis=1)
+    features = np.concatenate([points, normal_length * normals], axis=1)
+    pull_distance, pull = cKDTree(scan_features, balanced_tree=False).query(features, k=neighbours)
+    push_distance, push = cKDTree(features, balanced_tree=False).query(scan_features, k=neighbours)
+    rows = np.concatenate([np.repeat(np.arange(len(points)), neighbours), push.reshape(-1)])
+    columns = np.concatenate([pull.reshape(-1), np.repeat(np.arange(len(voters)), neighbours)])
+    affinity = np.concatenate([_affinity(pull_distance).reshape(-1), _affinity(push_distance).reshape(-1)])
+    mixing = sparse.csr_array((affinity, (rows, columns)), shape=(len(points), len(voters)))
+    mixing = sparse.diags_array(1.0 / np.asarray(mixing.sum(axis=1)).ravel()) @ mixing
+    target = mixing @ surface.points[voters]
+    normal = mixing @ surface.normals[voters]
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    away = np.linalg.norm(points - target, axis=1)
+    weights = 1.0 / (1.0 + (away / (robust_scale * gate)) ** 2) ** 2
+    weights[(away > gate) | (np.einsum("va,va->v", normals, normal) < min_normal_cosine)] = 0.0
+    return Matches(target, normal, weights, away, voters[pull[:, 0]])
+
+
+def _affinity(distance: np.ndarray) -> np.ndarray:
+    weight = 1.0 / np.maximum(distance, 1e-9) ** 2
+    return weight / weight.sum(axis=1, keepdims=True)
 
 
 @njit(cache=True)

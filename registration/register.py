@@ -15,7 +15,7 @@ from capture4d.errors import InputError
 from capture4d.types import GarmentScan
 from registration.boundary import BorderTargets, border_targets, tangent_free_metric
 from registration.config import BoundaryRule, RegistrationConfig, Schedule
-from registration.correspondences import ScanSurface, match, mesh_normals, prepare_scan
+from registration.correspondences import ScanSurface, match, match_both_ways, mesh_normals, prepare_scan
 from registration.deformation_graph import identity_nodes, rows_of_vertices, smooth_rows
 from registration.energies import edge_vectors, plane_metric, rigid_term, stretch_metric, tangential_metric
 from registration.solver import Rows, RowTerm, gauss_newton_step
@@ -193,10 +193,17 @@ def _data_term(
     rows: Rows, surface: ScanSurface, points: np.ndarray, normals: np.ndarray, gate: float, config: RegistrationConfig
 ) -> RowTerm:
     data = config.data
-    found = match(
-        surface, points, normals,
-        gate=gate, min_normal_cosine=data.min_normal_cosine, robust_scale=data.robust_scale,
-    )  # fmt: skip
+    if data.rule == "both_ways":
+        found = match_both_ways(
+            surface, points, normals, gate=gate, min_normal_cosine=data.min_normal_cosine,
+            robust_scale=data.robust_scale, neighbours=3, max_points=data.max_voters,
+            normal_length=data.normal_length,
+        )  # fmt: skip
+    else:
+        found = match(
+            surface, points, normals,
+            gate=gate, min_normal_cosine=data.min_normal_cosine, robust_scale=data.robust_scale,
+        )  # fmt: skip
     metric = plane_metric(found.normals, found.weights / len(points), data.point_share)
     return RowTerm(rows, metric, points - found.points)
 
