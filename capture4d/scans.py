@@ -15,11 +15,10 @@ from __future__ import annotations
 
 import hashlib
 import re
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Float32, Int32, UInt8
@@ -27,6 +26,18 @@ from jaxtyping import Float32, Int32, UInt8
 from capture4d.errors import InputError
 from capture4d.mesh import boundary_loops
 from capture4d.mesh_files import MESH_SUFFIXES, read_mesh, write_mesh
+from capture4d.records import (
+    ArrayFile,
+    load_body,
+    load_garment,
+    load_poses,
+    load_rig,
+    mesh_arrays,
+    save_body,
+    save_garment,
+    save_poses,
+    save_rig,
+)
 from capture4d.types import Body, Garment, Mesh, PoseSequence, Rig, Scan
 from capture4d.workdir import read_json, write_json, write_npz
 
@@ -176,8 +187,10 @@ def read_capture(path: str | Path) -> Capture:
         raise InputError(f"{description}: {error}") from None
     missing = [frame_id for frame_id in capture.frame_ids if frame_id not in present]
     if missing:
-        raise InputError(f"{path / 'scans' / f'{missing[0]:06d}.ply'}: no such scan; {len(missing)} of "
-                         f"{len(capture.frame_ids)} frames in capture.json have none")
+        raise InputError(
+            f"{path / 'scans' / f'{missing[0]:06d}.ply'}: no such scan; {len(missing)} of "
+            f"{len(capture.frame_ids)} frames in capture.json have none"
+        )
     return capture
 
 
@@ -267,8 +280,8 @@ def read_poses(capture: Capture) -> PoseSequence | None:
     missing = [frame_id for frame_id in capture.frame_ids if frame_id not in index]
     if missing:
         raise InputError(
-            f"{path}: expected a pose for each of {len(capture.frame_ids)} scans, found none for {len(missing)} of them, "
-            f"frame {missing[0]} first"
+            f"{path}: expected a pose for each of {len(capture.frame_ids)} scans, "
+            f"found none for {len(missing)} of them, frame {missing[0]} first"
         )
     rows = [index[frame_id] for frame_id in capture.frame_ids]
     return replace(
@@ -304,118 +317,9 @@ def read_template(capture: Capture) -> Garment:
             if capture.units != "m":
                 mesh = mesh.with_vertices(mesh.vertices * np.float32(_METRES[capture.units]))
             return Garment(mesh, {f"border_{index}": loop for index, loop in enumerate(boundary_loops(mesh.faces))})
-    raise InputError(f"{capture.path / 'template.npz'}: no such file, nor a template.obj; registration needs a template")
-
-
-def save_body(path: str | Path, body: Body) -> None:
-    optional = {"pose_directions": body.pose_directions, "regions": body.regions}
-    write_npz(
-        path,
-        **_mesh_arrays("template_", body.template),
-        shape_directions=body.shape_directions,
-        joints=body.joints,
-        joint_directions=body.joint_directions,
-        joint_names=np.array(body.joint_names),
-        parents=body.parents,
-        skin_weights=body.skin_weights,
-        **{name: array for name, array in optional.items() if array is not None},
+    raise InputError(
+        f"{capture.path / 'template.npz'}: no such file, nor a template.obj; registration needs a template"
     )
-
-
-def load_body(path: str | Path) -> Body:
-    with _Arrays(path) as arrays:
-        return Body(
-            template=arrays.mesh("template_"),
-            shape_directions=arrays["shape_directions"],
-            joints=arrays["joints"],
-            joint_directions=arrays["joint_directions"],
-            joint_names=arrays.names("joint_names"),
-            parents=arrays["parents"],
-            skin_weights=arrays["skin_weights"],
-            pose_directions=arrays.get("pose_directions"),
-            regions=arrays.get("regions"),
-        )
-
-
-def save_poses(path: str | Path, poses: PoseSequence) -> None:
-    write_npz(
-        path,
-        rotations=poses.rotations,
-        translations=poses.translations,
-        shape=poses.shape,
-        frame_ids=poses.frame_ids,
-        fps=np.float64(poses.fps),
-        joint_names=np.array(poses.joint_names),
-    )
-
-
-def load_poses(path: str | Path) -> PoseSequence:
-    with _Arrays(path) as arrays:
-        return PoseSequence(
-            rotations=arrays["rotations"],
-            translations=arrays["translations"],
-            shape=arrays["shape"],
-            frame_ids=arrays["frame_ids"],
-            fps=float(arrays["fps"]),
-            joint_names=arrays.names("joint_names"),
-        )
-
-
-def save_garment(path: str | Path, garment: Garment) -> None:
-    optional = {
-        "embedding_faces": garment.embedding_faces,
-        "embedding_barycentric": garment.embedding_barycentric,
-        "skin_weights": garment.skin_weights,
-    }
-    write_npz(
-        path,
-        **_mesh_arrays("template_", garment.template),
-        **{f"loop_{name}": loop for name, loop in garment.loops.items()},
-        **{name: array for name, array in optional.items() if array is not None},
-    )
-
-
-def load_garment(path: str | Path) -> Garment:
-    with _Arrays(path) as arrays:
-        return Garment(
-            template=arrays.mesh("template_"),
-            loops=arrays.prefixed("loop_"),
-            embedding_faces=arrays.get("embedding_faces"),
-            embedding_barycentric=arrays.get("embedding_barycentric"),
-            skin_weights=arrays.get("skin_weights"),
-        )
-
-
-def save_rig(path: str | Path, rig: Rig) -> None:
-    cameras = [
-        {
-            "name": name,
-            "width": int(rig.image_sizes[index, 0]),
-            "height": int(rig.image_sizes[index, 1]),
-            "intrinsics": rig.intrinsics[index],
-            "distortion": rig.distortion[index],
-            "T_camera_world": rig.T_camera_world[index],
-        }
-        for index, name in enumerate(rig.names)
-    ]
-    write_json(path, {"format": _FORMAT, "cameras": cameras})
-
-
-def load_rig(path: str | Path) -> Rig:
-    cameras = read_json(path)
-    try:
-        cameras = cameras["cameras"]
-        return Rig(
-            names=tuple(str(camera["name"]) for camera in cameras),
-            intrinsics=np.array([camera["intrinsics"] for camera in cameras], np.float64),
-            distortion=np.array([camera["distortion"] for camera in cameras], np.float64),
-            T_camera_world=np.array([camera["T_camera_world"] for camera in cameras], np.float64),
-            image_sizes=np.array([[camera["width"], camera["height"]] for camera in cameras], np.int32),
-        )
-    except KeyError as error:
-        raise InputError(f"{path}: expected the entry {error} for every camera, found none") from None
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{path}: {error}") from None
 
 
 # --- truth -------------------------------------------------------------------------------------------------------
@@ -424,7 +328,7 @@ def load_rig(path: str | Path) -> Rig:
 def write_truth_model(path: str | Path, model: TruthModel) -> None:
     write_npz(
         path,
-        **_mesh_arrays("fine_", model.fine),
+        **mesh_arrays("fine_", model.fine),
         **{f"loop_{name}": loop for name, loop in model.loops.items()},
         template_faces=model.template_faces,
         template_barycentric=model.template_barycentric,
@@ -435,7 +339,7 @@ def read_truth_model(capture: Capture) -> TruthModel | None:
     path = capture.path / "truth" / "model.npz"
     if not path.is_file():
         return None
-    with _Arrays(path) as arrays:
+    with ArrayFile(path) as arrays:
         return TruthModel(
             fine=arrays.mesh("fine_"),
             loops=arrays.prefixed("loop_"),
@@ -455,64 +359,14 @@ def write_truth_frame(path: str | Path, frame: TruthFrame) -> None:
 
 
 def read_truth_frame(capture: Capture, frame_id: int) -> TruthFrame:
-    with _Arrays(_truth_path(capture, frame_id)) as arrays:
+    with ArrayFile(_truth_path(capture, frame_id)) as arrays:
         return TruthFrame(arrays["vertices"], arrays["rotations"], arrays["translation"], arrays["labels"])
 
 
 def read_truth_vertices(capture: Capture, frame_id: int) -> Float32[np.ndarray, "fine 3"]:
-    with _Arrays(_truth_path(capture, frame_id)) as arrays:
+    with ArrayFile(_truth_path(capture, frame_id)) as arrays:
         return arrays["vertices"]
 
 
 def _truth_path(capture: Capture, frame_id: int) -> Path:
     return capture.path / "truth" / f"{frame_id:06d}.npz"
-
-
-# --- npz ---------------------------------------------------------------------------------------------------------
-
-
-def _mesh_arrays(prefix: str, mesh: Mesh) -> dict[str, np.ndarray]:
-    arrays = {f"{prefix}vertices": mesh.vertices, f"{prefix}faces": mesh.faces}
-    return arrays if mesh.uv is None else {**arrays, f"{prefix}uv": mesh.uv}
-
-
-class _Arrays:
-    """An open npz file in which everything that is wrong becomes an InputError that names the file."""
-
-    def __init__(self, path: str | Path) -> None:
-        self._path = Path(path)
-
-    def __enter__(self) -> _Arrays:
-        try:
-            self._file = np.load(self._path, allow_pickle=False)
-            self._names = self._file.files
-        except FileNotFoundError:
-            raise InputError(f"{self._path}: no such file") from None
-        except (ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
-            raise InputError(f"{self._path}: not a readable npz file, cut off or damaged ({error})") from None
-        return self
-
-    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
-        self._file.close()
-        if isinstance(error, InputError) and not str(error).startswith(str(self._path)):
-            raise InputError(f"{self._path}: {error}") from None
-
-    def __getitem__(self, name: str) -> np.ndarray:
-        if name not in self._names:
-            raise InputError(f"{self._path}: expected an array '{name}', found {', '.join(self._names) or 'none'}")
-        try:
-            return self._file[name]
-        except (ValueError, EOFError, zipfile.BadZipFile) as error:
-            raise InputError(f"{self._path}: damaged array '{name}' ({error})") from None
-
-    def get(self, name: str) -> np.ndarray | None:
-        return self[name] if name in self._names else None
-
-    def names(self, name: str) -> tuple[str, ...]:
-        return tuple(str(entry) for entry in self[name])
-
-    def prefixed(self, prefix: str) -> dict[str, np.ndarray]:
-        return {name.removeprefix(prefix): self[name] for name in self._names if name.startswith(prefix)}
-
-    def mesh(self, prefix: str) -> Mesh:
-        return Mesh(self[f"{prefix}vertices"], self[f"{prefix}faces"], self.get(f"{prefix}uv"))

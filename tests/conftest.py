@@ -2,4 +2,6 @@
 
 from jaxtyping import install_import_hook
 
-install_import_hook(["capture4d", "data_synth", "registration", "retarget", "wrinkles", "benchmarks"], "beartype.beartype")
+install_import_hook(
+    ["capture4d", "data_synth", "registration", "retarget", "wrinkles", "benchmarks"], "beartype.beartype"
+)
