@@ -1,0 +1,16 @@
+"""Where expensive things that can be made again are kept between runs: the user's cache folder."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import platformdirs
+
+
+def user_cache_folder() -> Path:
+    """The cache folder, made if absent; `CAPTURE4D_CACHE` names another one."""
+    override = os.environ.get("CAPTURE4D_CACHE")
+    folder = Path(override) if override else Path(platformdirs.user_cache_dir("capture4d", appauthor=False))
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder

@@ -1,0 +1,92 @@
+"""Settings of the synthetic scanner. Standard library only, so that the command line can list them at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class GarmentStyle:
+    """A T-shirt, relative to the person it is drafted for."""
+
+    size: float = 1.0
+    """Scale of the draft's widths; 1 fits the person before ease."""
+    ease: float = 0.22
+    """Girth beyond the chest's, as a fraction of it; below 0.12 a shirt is nearly free of folds."""
+    sleeve_length: float = 0.62
+    """Underarm length of the sleeve, as a fraction of the upper arm."""
+    hem_drop_m: float = 0.12
+    """How far below the hip joint the hem lies, metres."""
+
+
+@dataclass(frozen=True)
+class Fabric:
+    """What the cloth is made of."""
+
+    name: str = "jersey"
+    density: float = 0.2
+    """Mass of an area, kg/m2."""
+    stretch_stiffness: float = 1e3
+    """Membrane stiffness of the coarse sheet, N/m."""
+    coarse_bending: float = 2e-5
+    """Bending stiffness of the coarse sheet, N m."""
+    friction: float = 0.25
+    """Coulomb coefficient between cloth and body."""
+    shrink: tuple[float, float] = (0.93, 0.98)
+    """Size of the coarse rest pattern across and along the grain; the rest becomes fine folds."""
+    fold_bending: float = 0.2
+    """Bending gain of the wrinkle mesh, 0 to 1: more makes wider folds."""
+
+
+FABRICS = {
+    "jersey": Fabric(),
+    "shirt-cotton": Fabric("shirt-cotton", density=0.13, coarse_bending=4e-5, fold_bending=0.12),
+    "linen": Fabric("linen", density=0.18, coarse_bending=5e-5, fold_bending=0.3, shrink=(0.92, 0.975)),
+}
+
+
+@dataclass(frozen=True)
+class SimulationConfig:
+    """The coarse simulation."""
+
+    vertices: int = 5000
+    """Vertices of the simulated sheet."""
+    fps: float = 60.0
+    substeps: int = 5
+    iterations: int = 8
+    """Vertex block descent sweeps a substep; raise both for finer sheets, which converge more slowly."""
+    approach_frames: int = 30
+    """Frames from the dressing pose to the clip's first pose."""
+    rest_frames: int = 20
+    """Frames at rest before the clip starts."""
+    contact_gap_m: float = 0.008
+    damping: float = 0.998
+    """Share of the velocity kept each substep."""
+    calm_damping: float = 0.85
+
+
+@dataclass(frozen=True)
+class RelaxationConfig:
+    """The fine folds."""
+
+    vertices: int = 80_000
+    """Vertices of the wrinkle mesh."""
+    sweeps: int = 100
+    """Gauss-Seidel sweeps a frame."""
+    start_sweeps_factor: int = 4
+    """How many times more where there is no frame before."""
+    pull_normal: float = 0.001
+    """Pull towards the coarse sheet along its normal, per sweep."""
+    pull_tangential: float = 0.0005
+    """The same in the sheet's plane."""
+    radius_m: float = 0.012
+    """No vertex leaves the coarse sheet farther than this."""
+    body_margin_m: float = 0.003
+    """Clearance to the body."""
+    warm_start: float = 0.75
+    """Share of the folds carried over from the frame before; the rest is the imperfection. 1 moves most smoothly, but
+    then the folds are an accident of the start; below 0.5 they shimmer."""
+    imperfection_m: float = 0.001
+    """Standard deviation of the imperfection, metres."""
+    imperfection_width_m: float = 0.0125
+    """Width of the imperfection; white noise would fold the cloth into crepe."""

@@ -1,0 +1,222 @@
+"""Coarse cloth on a moving body: newton's vertex block descent on the triangulated pattern.
+
+The rest shape is the flat pattern, so seams, ease and grain are real. It is shrunk a little against the true cloth: the
+coarse sheet is the low-frequency surrogate of a garment that has more material than the sheet can buckle, and the
+excess becomes fine folds in `data_synth.wrinkle_relaxation`.
+
+Frames: world, Y up, metres. The sequence is dressing pose -> first pose -> rest a little -> the clip.
+References: Chen et al., Vertex Block Descent (SIGGRAPH 2024); the shrunk pattern is ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import redirect_stdout
+from io import StringIO
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation, Slerp
+
+from capture4d.body import PosedBody, ShapedBody, with_pose
+from capture4d.open3d_loading import import_open3d
+from capture4d.types import PoseSequence
+from data_synth.config import Fabric, SimulationConfig
+from data_synth.patterns import PanelMesh
+
+__all__ = ["approach_poses", "dress", "simulate"]
+
+DRESSING_ARM_RAISE_DEG = 42.0
+"""Raises the arms of the rest pose to about the horizontal, so that a flat T fits over them."""
+
+LIFT_M = 0.035
+"""The panels start this far above their place, clear of the shoulders."""
+PILLOW_M = 0.13
+"""Distance from the seams over which front and back part."""
+
+
+def dressing_rotations(shaped: ShapedBody) -> np.ndarray:
+    """Joint rotations, (J, 3, 3), with the arms held out sideways."""
+    names = shaped.body.joint_names
+    rotations = np.repeat(np.eye(3)[None], len(names), axis=0)
+    for side, sign in (("L", 1), ("R", -1)):
+        raised = Rotation.from_euler("z", sign * DRESSING_ARM_RAISE_DEG, degrees=True)
+        rotations[names.index(f"upperarm01.{side}")] = raised.as_matrix()
+    return rotations
+
+
+def approach_poses(shaped: ShapedBody, poses: PoseSequence, config: SimulationConfig) -> list[PosedBody]:
+    """The way from the dressing pose into the clip: `approach_frames` of motion, then `rest_frames` standing still."""
+    start, end = dressing_rotations(shaped), poses.rotations[0].astype(np.float64)
+    start[0] = end[0]
+    ramp = np.linspace(0, 1, config.approach_frames)
+    ramp = ramp * ramp * (3 - 2 * ramp)
+    paths = [
+        Slerp([0, 1], Rotation.from_matrix(np.stack([start[joint], end[joint]])))(ramp).as_matrix()
+        for joint in range(len(start))
+    ]
+    moving = [with_pose(shaped, rotations, poses.translations[0]) for rotations in np.stack(paths, axis=1)]
+    return moving + [moving[-1]] * config.rest_frames
+
+
+def dress(shaped: ShapedBody, mesh: PanelMesh, panel_names: tuple[str, ...], origins: np.ndarray) -> np.ndarray:
+    """Hang the panels around the body of the dressing pose, root at its rest place.
+
+    Front and back stand off the trunk as pillows that meet at the side seams; sleeves are tubes around the arms. The
+    surface is outside the body everywhere, not yet at its rest lengths.
+
+    Args:
+        origins: (P, 2) where each panel's draft origin lies in the plane domain.
+    Returns:
+        Vertex positions (V, 3), metres.
+    """
+    surface = with_pose(shaped, dressing_rotations(shaped), np.zeros(3)).vertices()
+    names = shaped.body.joint_names
+    shoulder = shaped.joints[names.index("upperarm01.L")]
+    trunk = surface[(np.abs(surface[:, 0]) < 0.12) & (np.abs(surface[:, 1] - shoulder[1] + 0.15) < 0.25)]
+    middle_z, depth = np.mean([trunk[:, 2].min(), trunk[:, 2].max()]), np.ptp(trunk[:, 2]) / 2 + 0.06
+    panel = np.array(panel_names)[mesh.face_panels[mesh.vertex_faces]]
+    draft = mesh.vertex_uv - origins[mesh.face_panels[mesh.vertex_faces]]
+    placed = np.zeros((mesh.vertex_count, 3))
+    for name, sign in (("front", 1.0), ("back", -1.0)):
+        rows = panel == name
+        placed[rows, 0], placed[rows, 1] = sign * draft[rows, 0], draft[rows, 1] + LIFT_M
+    seam_rows = np.unique(np.concatenate(list(mesh.seams.values())))
+    seams = cKDTree(placed[seam_rows[np.char.find(panel[seam_rows], "sleeve") < 0], :2])
+    for name, sign in (("front", 1.0), ("back", -1.0)):
+        rows = panel == name
+        near = np.minimum(seams.query(placed[rows, :2])[0] / PILLOW_M, 1)
+        placed[rows, 2] = middle_z + sign * depth * np.sqrt(1 - (1 - near) ** 2)
+    half = np.abs(draft[panel == "front", 0]).max()
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        rows = panel == f"sleeve_{side}"
+        arm = surface[(sign * surface[:, 0] > half) & (sign * surface[:, 0] < half + 0.12)]
+        placed[rows] = _tube(draft[rows], arm, sign, half)
+    placed = _push_outside(placed, surface, shaped.body.template.faces, clearance=0.008)
+    # Where panels coincide triangles have no area, and newton would leave them out.
+    return placed + np.random.default_rng(0).normal(scale=2e-4, size=placed.shape)
+
+
+def _tube(draft: np.ndarray, arm: np.ndarray, sign: float, start_x: float) -> np.ndarray:
+    """Wrap a sleeve, top of the cap upwards, around an arm that points along sign * X."""
+    u, v = draft.T
+    middle = (arm[:, 1:].min(axis=0) + arm[:, 1:].max(axis=0)) / 2
+    bins = np.linspace(v.min(), v.max() + 1e-9, 24)
+    row = np.digitize(v, bins)
+    width = np.array([np.abs(u[row == r]).max(initial=0) for r in range(len(bins) + 1)])
+    widest = width.max()
+    angle = np.pi * u / np.where(v > 0, widest, np.maximum(width[row], 0.5 * widest))
+    radius = max(widest / np.pi, np.ptp(arm[:, 1:], axis=0).max() / 2 + 0.015)
+    around = np.stack([np.cos(angle), -sign * np.sin(angle)], axis=1) * radius
+    return np.column_stack([sign * (start_x - v), middle + around])
+
+
+def _push_outside(points: np.ndarray, surface: np.ndarray, faces: np.ndarray, clearance: float) -> np.ndarray:
+    """Move every point nearer than `clearance`, or inside, to that distance outside the surface."""
+    scene = import_open3d().t.geometry.RaycastingScene(nthreads=1)
+    scene.add_triangles(surface.astype(np.float32), faces.astype(np.uint32))
+    query = points.astype(np.float32)
+    closest = scene.compute_closest_points(query)
+    foot, normals = closest["points"].numpy(), closest["primitive_normals"].numpy()
+    near = np.einsum("vc,vc->v", query - foot, normals) < clearance
+    return np.where(near[:, None], foot + clearance * normals, points)
+
+
+def simulate(
+    mesh: PanelMesh,
+    start: np.ndarray,
+    body_surfaces: Sequence[np.ndarray],
+    body_faces: np.ndarray,
+    fabric: Fabric,
+    config: SimulationConfig,
+    *,
+    calm_frames: int,
+) -> Iterator[np.ndarray]:
+    """Move the cloth through a sequence of body surfaces.
+
+    Args:
+        start: (V, 3) cloth in the first frame, metres.
+        body_surfaces: one (B, 3) surface a frame, `config.fps` apart.
+        calm_frames: frames at the start in which gravity is halved and motion damped, while the panels close.
+    Yields:
+        Cloth vertices (V, 3) float64 for each frame, the first included.
+    """
+    import warp as wp
+
+    wp.config.quiet = True
+    with redirect_stdout(StringIO()):  # warp announces its devices on first use
+        wp.init()
+    import newton
+
+    model, body = _build_model(mesh, start, body_surfaces, body_faces, fabric)
+    solver = newton.solvers.SolverVBD(model, iterations=config.iterations)
+    pipeline = newton.CollisionPipeline(model, soft_contact_gap=config.contact_gap_m)
+    contacts, control = pipeline.contacts(), model.control()
+    state, scratch = model.state(), model.state()
+    step = 1 / config.fps / config.substeps
+    gravity = np.array([0.0, -9.81, 0.0], np.float32)
+    yield start
+    for frame in range(1, len(body_surfaces)):
+        previous, current = body_surfaces[frame - 1], body_surfaces[frame]
+        calm = frame <= calm_frames
+        model.set_gravity(tuple(gravity * (0.5 if calm else 1.0)))
+        for substep in range(config.substeps):
+            blend = (substep + 1) / config.substeps
+            body.mesh.points.assign(((1 - blend) * previous + blend * current).astype(np.float32))
+            body.mesh.refit()
+            if body.mesh.velocities is not None:
+                body.mesh.velocities.assign(((current - previous) * config.fps).astype(np.float32))
+            state.clear_forces()
+            pipeline.collide(state, contacts)
+            solver.step(state, scratch, control, contacts, step)
+            state, scratch = scratch, state
+            keep = config.calm_damping if calm else config.damping
+            state.particle_qd.assign(state.particle_qd.numpy() * np.float32(keep))
+        yield state.particle_q.numpy().astype(np.float64)
+
+
+def _build_model(mesh, start, body_surfaces, body_faces, fabric):
+    import newton
+    import warp as wp
+
+    builder = newton.ModelBuilder(up_axis=newton.Axis.Y)
+    builder.add_cloth_mesh(
+        pos=wp.vec3(0.0, 0.0, 0.0),
+        rot=wp.quat_identity(),
+        scale=1.0,
+        vel=wp.vec3(0.0, 0.0, 0.0),
+        vertices=[wp.vec3(*point) for point in start],
+        indices=mesh.faces.ravel().tolist(),
+        density=fabric.density,
+        tri_ke=fabric.stretch_stiffness,
+        tri_ka=fabric.stretch_stiffness,
+        tri_kd=1e-3,
+        edge_ke=fabric.coarse_bending,
+        edge_kd=1e-3,
+        particle_radius=0.003,
+    )
+    a, b, c = (mesh.uv * fabric.shrink).transpose(1, 0, 2)
+    length = np.linalg.norm(b - a, axis=1)
+    along = (b - a) / length[:, None]
+    side = c - a
+    x = np.einsum("fc,fc->f", side, along)
+    y = along[:, 0] * side[:, 1] - along[:, 1] * side[:, 0]
+    areas = 0.5 * length * y
+    builder.tri_poses = [
+        wp.mat22(*np.linalg.inv([[l, p], [0.0, q]]).ravel()) for l, p, q in zip(length, x, y, strict=True)
+    ]
+    builder.tri_areas = areas.tolist()
+    builder.edge_rest_angle = [0.0] * len(builder.edge_rest_angle)
+    mass = np.bincount(mesh.faces.ravel(), np.repeat(areas * fabric.density / 3, 3), minlength=mesh.vertex_count)
+    builder.particle_mass = mass.tolist()
+    body = newton.Mesh(body_surfaces[0].astype(np.float32), body_faces.ravel(), compute_inertia=False)
+    builder.add_shape_mesh(body=-1, mesh=body, cfg=newton.ModelBuilder.ShapeConfig(margin=0.002))
+    builder.color(include_bending=True)
+    model = builder.finalize(device="cpu")
+    model.soft_contact_ke, model.soft_contact_kd, model.soft_contact_mu = 1e4, 1e-3, fabric.friction
+    low = np.min([surface.min(axis=0) for surface in body_surfaces], axis=0)
+    high = np.max([surface.max(axis=0) for surface in body_surfaces], axis=0)
+    # The box of a moving collider is computed once: make it hold the whole motion.
+    model.shape_collision_aabb_lower.assign((low - 1.0).astype(np.float32)[None])
+    model.shape_collision_aabb_upper.assign((high + 1.0).astype(np.float32)[None])
+    return model, body
