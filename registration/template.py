@@ -52,6 +52,9 @@ class TemplateAnalysis:
     """Vertices as they are."""
     edge_rows: Rows
     """Edge vectors."""
+    fan_offsets: Int32[np.ndarray, " verts_plus_1"]
+    fan_faces: Int32[np.ndarray, " corners"]
+    """Faces around vertex v: fan_faces[fan_offsets[v] : fan_offsets[v + 1]]."""
     laplacian_rows: Rows
     """Each vertex minus the mean of its neighbours; along the border, of its neighbours on the border."""
 
@@ -83,6 +86,8 @@ def analyse_template(garment: Garment, config: RegistrationConfig) -> TemplateAn
         border=border,
         vertex_rows=_rows([np.arange(len(rest))], [1.0]),
         edge_rows=_rows([edges[:, 0], edges[:, 1]], [-1.0, 1.0]),
+        fan_offsets=np.concatenate([[0], np.cumsum(np.bincount(faces.reshape(-1), minlength=len(rest)))]).astype(np.int32),
+        fan_faces=(np.argsort(faces.reshape(-1), kind="stable") // 3).astype(np.int32),
         laplacian_rows=_laplacian_rows(edges, faces, len(rest)),
     )
 

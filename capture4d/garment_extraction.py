@@ -1,0 +1,223 @@
+"""The garment of a coloured scan: cut out by colour, with the points of its painted borders.
+
+Paints are told apart by chroma: the direction of linear RGB, which shading hardly changes, and a wide band of lightness
+around the paint's own. Vertices of mixed colour between two paints go with the majority of their neighbours; only parts
+that contain garment colour survive, so that a hand of the border's colour does not.
+
+A border point is a vertex on an open edge of what was cut out (whether the scan ends there or the next colour begins)
+that lies on paint and on the paint's far side, seen from the garment: along the surface it is almost a band's width away
+from garment colour. Rims of occlusion holes are nearer, or not on paint, and drop out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import lru_cache
+
+import numpy as np
+from jaxtyping import Int, UInt8
+from numba import njit
+from scipy import sparse
+from scipy.sparse import csgraph
+
+from capture4d.errors import InputError
+from capture4d.mesh_kernels import face_components, open_vertices
+from capture4d.types import GarmentScan, Mesh, Scan
+
+__all__ = ["ColourNotFoundError", "classify_colours", "extract_garment"]
+
+Colour = tuple[int, int, int]
+
+OTHER, GARMENT, FIRST_PAINT = 0, 1, 2
+
+MAX_ANGLE = 0.24
+"""Largest angle between a colour and a paint in linear RGB, radians: shading under tinted light stays below 0.15."""
+LIGHTNESS_RANGE = (0.12, 4.0)
+"""Brightness relative to the paint's own that still counts as shading."""
+MIN_SHARE = 1e-3
+"""Share of the scan's vertices below which a paint counts as not found."""
+MIN_PART = 0.005
+"""Parts with a smaller share of the garment's faces are dropped."""
+FAR_SIDE = 0.6
+"""A border point is at least this share of the band's width away from garment colour."""
+
+
+class ColourNotFoundError(InputError):
+    """The scan is sound, but the garment or a painted border is not in it."""
+
+
+def extract_garment(
+    scan: Scan, garment_colour: Colour, boundary_colours: Mapping[str, Colour], *, source: str = "scan"
+) -> GarmentScan:
+    """Cut the garment out of a scan.
+
+    Args:
+        garment_colour: sRGB of the cloth.
+        boundary_colours: sRGB of the paint on each named border; equal colours cannot tell their loops apart.
+        source: how errors call the scan, usually its path.
+    Raises:
+        ColourNotFoundError: the garment's or a border's colour is not in the scan.
+    """
+    paints = tuple(dict.fromkeys(tuple(colour) for colour in boundary_colours.values()))
+    labels = classify_colours(scan.colours, tuple(garment_colour), paints)
+    _require_colours(labels, tuple(garment_colour), paints, source)
+    faces = scan.mesh.faces
+    labels = settle_labels(faces, labels)
+    mask = _garment_faces(faces, labels)
+    if not mask.any():
+        raise ColourNotFoundError(
+            f"{source}: expected a connected garment of colour {_hex(garment_colour)}, found scattered specks"
+        )
+    used = np.zeros(len(labels), bool)
+    used[faces[mask].reshape(-1)] = True
+    renumbered = (np.cumsum(used) - 1).astype(np.int32)
+    mesh = Mesh(scan.mesh.vertices[used], renumbered[faces[mask]])
+    kept = labels[used]
+    rim = _border_vertices(mesh, kept, len(paints))
+    loop_of_paint = _loops_of_paints(boundary_colours, paints)
+    return GarmentScan(
+        mesh=mesh,
+        boundary_points=mesh.vertices[rim],
+        boundary_loops=loop_of_paint[kept[rim] - FIRST_PAINT],
+        loop_names=tuple(boundary_colours),
+        frame_id=scan.frame_id,
+    )
+
+
+def classify_colours(
+    colours: UInt8[np.ndarray, "verts 3"], garment_colour: Colour, paints: tuple[Colour, ...]
+) -> UInt8[np.ndarray, " verts"]:
+    """0 for anything else, 1 for the garment, 2 and on for the paints, vertex by vertex."""
+    table = _label_table(garment_colour, paints)
+    quantised = (colours >> 2).astype(np.int32)
+    return table[(quantised[:, 0] << 12) | (quantised[:, 1] << 6) | quantised[:, 2]]
+
+
+@lru_cache(maxsize=8)
+def _label_table(garment_colour: Colour, paints: tuple[Colour, ...]) -> np.ndarray:
+    """Labels of all colours at six bits per channel: classifying a scan is one look-up."""
+    level = np.arange(64) * 4 + 2
+    red, green, blue = np.meshgrid(level, level, level, indexing="ij")
+    colours = _linear(np.stack([red, green, blue], axis=-1).reshape(-1, 3))
+    brightness = np.linalg.norm(colours, axis=1)
+    references = _linear(np.array([garment_colour, *paints], np.float64))
+    reference_brightness = np.maximum(np.linalg.norm(references, axis=1), 1e-4)
+    cosine = (colours @ references.T) / np.maximum(brightness[:, None] * reference_brightness, 1e-9)
+    angle = np.arccos(np.clip(cosine, -1.0, 1.0))
+    ratio = brightness[:, None] / reference_brightness
+    angle[(ratio < LIGHTNESS_RANGE[0]) | (ratio > LIGHTNESS_RANGE[1]) | (angle > MAX_ANGLE)] = np.inf
+    nearest = np.argmin(angle, axis=1)
+    return np.where(np.isfinite(angle.min(axis=1)), nearest + 1, OTHER).astype(np.uint8)
+
+
+def _linear(colours: np.ndarray) -> np.ndarray:
+    """sRGB to linear light; shading scales the latter."""
+    value = colours / 255.0
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+
+
+def _require_colours(labels: np.ndarray, garment_colour: Colour, paints: tuple[Colour, ...], source: str) -> None:
+    share = np.bincount(labels, minlength=FIRST_PAINT + len(paints)) / max(len(labels), 1)
+    wanted = [("garment colour", garment_colour, 10 * MIN_SHARE), *(("border colour", p, MIN_SHARE) for p in paints)]
+    for index, (name, colour, least) in enumerate(wanted, start=GARMENT):
+        if share[index] < least:
+            raise ColourNotFoundError(
+                f"{source}: {name} {_hex(colour)} not found: expected at least {100 * least:g} % of the vertices, "
+                f"found {100 * share[index]:.2g} %"
+            )
+
+
+def _hex(colour: Colour) -> str:
+    return "#{:02x}{:02x}{:02x}".format(*colour)
+
+
+def _garment_faces(faces: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """Faces on garment or paint, in parts that are large enough and contain garment colour."""
+    marked = labels > OTHER
+    active = marked[faces[:, 0]] & marked[faces[:, 1]] & marked[faces[:, 2]]
+    part = face_components(faces, len(labels), active)
+    inside = part >= 0
+    size = np.bincount(part[inside], minlength=len(labels))
+    cloth = np.bincount(part[inside], labels[faces[inside, 0]] == GARMENT, minlength=len(labels))
+    keep = (size >= MIN_PART * inside.sum()) & (cloth > 0.2 * size)
+    return inside & keep[np.maximum(part, 0)]
+
+
+def _border_vertices(mesh: Mesh, labels: np.ndarray, paints: int) -> Int[np.ndarray, " border"]:
+    """Open-edge vertices on the far side of the painted bands."""
+    if not paints:
+        return np.zeros(0, np.int64)
+    is_open, _ = open_vertices(mesh.faces, len(mesh.vertices))
+    candidates = np.flatnonzero(is_open & (labels >= FIRST_PAINT))
+    if not len(candidates):
+        return candidates
+    depth = _depth_in_paint(mesh, labels)
+    chosen = []
+    for paint in range(FIRST_PAINT, FIRST_PAINT + paints):
+        own = candidates[labels[candidates] == paint]
+        reached = np.isfinite(depth[own])
+        if reached.any():
+            width = np.percentile(depth[own[reached]], 75)
+            chosen.append(own[reached & (depth[own] >= FAR_SIDE * width)])
+    return np.sort(np.concatenate(chosen)) if chosen else candidates[:0]
+
+
+def _depth_in_paint(mesh: Mesh, labels: np.ndarray) -> np.ndarray:
+    """Distance of every painted vertex from garment colour along the surface, metres; 0 on the garment."""
+    faces = mesh.faces
+    painted = labels >= FIRST_PAINT
+    local_faces = faces[painted[faces].any(axis=1)]
+    local, renumbered = np.unique(local_faces, return_inverse=True)
+    corners = renumbered.reshape(-1, 3)
+    pairs = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
+    positions = mesh.vertices[local].astype(np.float64)
+    length = np.maximum(np.linalg.norm(positions[pairs[:, 0]] - positions[pairs[:, 1]], axis=1), 1e-9)
+    pairs, first = np.unique(np.sort(pairs, axis=1), axis=0, return_index=True)
+    graph = sparse.csr_array((length[first], (pairs[:, 0], pairs[:, 1])), shape=(len(local), len(local)))
+    depth = np.full(len(labels), np.inf)
+    sources = np.flatnonzero(~painted[local])
+    if len(sources):
+        depth[local] = csgraph.dijkstra(graph, directed=False, indices=sources, min_only=True)
+    return depth
+
+
+def _loops_of_paints(boundary_colours: Mapping[str, Colour], paints: tuple[Colour, ...]) -> np.ndarray:
+    """The loop each paint stands for, or -1 where several loops wear it."""
+    colours = [tuple(colour) for colour in boundary_colours.values()]
+    return np.array([colours.index(paint) if colours.count(paint) == 1 else -1 for paint in paints], np.int32)
+
+
+def settle_labels(faces: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """Two rounds of votes among neighbours: fills mixed colours between paints, and specks of the wrong one."""
+    count = int(labels.max(initial=0)) + 1
+    for _ in range(2):
+        labels = vote(faces, labels, count)
+    return labels
+
+
+@njit(cache=True)
+def vote(faces, labels, count):
+    """Each vertex takes the label of most of its neighbours if at least two thirds agree, or if it has none itself."""
+    votes = np.zeros((len(labels), count), np.int32)
+    for f in range(len(faces)):
+        for k in range(3):
+            a, b = faces[f, k], faces[f, (k + 1) % 3]
+            votes[a, labels[b]] += 1
+            votes[b, labels[a]] += 1
+    result = labels.copy()
+    for v in range(len(labels)):
+        best, total = 0, 0
+        for label in range(count):
+            total += votes[v, label]
+            if votes[v, label] > votes[v, best]:
+                best = label
+        if 3 * votes[v, best] >= 2 * total and total > 0:
+            result[v] = best
+        elif labels[v] == 0:
+            most = 0
+            for label in range(1, count):
+                if most == 0 or votes[v, label] > votes[v, most]:
+                    most = label
+            if most > 0 and 2 * votes[v, 0] <= total:
+                result[v] = most
+    return result

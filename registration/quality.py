@@ -1,0 +1,230 @@
+"""How good a registered frame is, from the scan alone: numbers, and a verdict with its reasons.
+
+    fit          template vertex to the scan's surface, over vertices with scan data; and scan point to template
+    border       template border to painted points, and painted points to the template's border curve
+    stretch      edge lengths over the template's
+    flips        faces that look the other way than the scan they lie on
+    intersections  faces that cut another face of the template
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float64
+from numba import njit
+from scipy.spatial import cKDTree
+
+from registration.config import QualityConfig
+from registration.correspondences import mesh_normals
+from registration.energies import edge_vectors
+from registration.register import FrameScan
+from registration.template import TemplateAnalysis
+
+__all__ = ["FrameQuality", "assess", "border_distances", "count_intersecting_faces"]
+
+Verdict = Literal["good", "check", "failed"]
+
+COVERED_SPACINGS = 2.5
+"""A vertex has scan data if a scan point lies within this many scan spacings of it, measured along the surface."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameQuality:
+    """Numbers, verdict and reasons of one frame."""
+
+    verdict: Verdict
+    reasons: tuple[str, ...]
+    residual_m: Float64[np.ndarray, " verts"]
+    """Distance to the scan's surface; NaN where the scan has no data near the vertex."""
+    numbers: Mapping[str, float]
+    """fit_mean_mm, fit_p95_mm, scan_fit_mean_mm, ..., as in metrics.jsonl; NaN where there is nothing to measure."""
+
+
+def assess(
+    analysis: TemplateAnalysis, scan: FrameScan, vertices: Float64[np.ndarray, "verts 3"], config: QualityConfig
+) -> FrameQuality:
+    """Measure a registered frame against its scan."""
+    normals = mesh_normals(vertices, analysis.faces)
+    distance, nearest = scan.surface.tree.query(vertices)
+    offset = vertices - scan.surface.points[nearest]
+    scan_normals = scan.surface.normals[nearest]
+    height = np.abs(np.einsum("va,va->v", offset, scan_normals))
+    sideways = np.sqrt(np.maximum(distance**2 - height**2, 0.0))
+    covered = sideways <= COVERED_SPACINGS * scan.surface.spacing
+    residual = np.where(covered, height, np.nan)
+    stretch = np.linalg.norm(edge_vectors(vertices, analysis.edges), axis=1) / np.maximum(analysis.rest_lengths, 1e-12)
+    against = (np.einsum("va,va->v", normals, scan_normals) < 0.0) & covered
+    flipped = int(against[analysis.faces].all(axis=1).sum())
+    border = border_distances(analysis, scan, vertices)
+    stride = max(1, len(scan.surface.points) // 4000)
+    scan_fit = 1e3 * _points_to_template(scan.surface.points[::stride], vertices, analysis)
+    fit = 1e3 * residual[covered]
+    numbers = {
+        "fit_mean_mm": _mean(fit),
+        "fit_p95_mm": _percentile(fit, 95),
+        "scan_fit_mean_mm": _mean(scan_fit),
+        "scan_fit_p95_mm": _percentile(scan_fit, 95),
+        "boundary_mean_mm": _mean(1e3 * border),
+        "boundary_p95_mm": _percentile(1e3 * border, 95),
+        "stretch_p99": _percentile(stretch, 99),
+        "flipped_faces": flipped,
+        "self_intersections": count_intersecting_faces(vertices, analysis.faces),
+        "covered_percent": 100.0 * float(covered.mean()),
+    }
+    verdict, reasons = _judge(numbers, len(analysis.faces), config)
+    return FrameQuality(verdict, reasons, residual, numbers)
+
+
+def border_distances(
+    analysis: TemplateAnalysis, scan: FrameScan, vertices: Float64[np.ndarray, "verts 3"]
+) -> Float64[np.ndarray, " distances"]:
+    """Distances, metres, from border vertices to painted points and from painted points to the border curve.
+
+    Points of one loop are compared with that loop where the paint tells.
+    """
+    border = analysis.border
+    found: list[np.ndarray] = []
+    for loop in np.unique(scan.border_loops):
+        painted = scan.border_points[scan.border_loops == loop]
+        own = np.ones(len(border.vertices), bool) if loop < 0 else border.loops == loop
+        start, end = vertices[border.vertices[own]], vertices[border.after[own]]
+        if not len(start) or not len(painted):
+            continue
+        found.append(cKDTree(painted).query(start)[0])
+        steps = np.linspace(0.0, 1.0, 8, endpoint=False)[:, None, None]
+        found.append(cKDTree(((1.0 - steps) * start + steps * end).reshape(-1, 3)).query(painted)[0])
+    return np.concatenate(found) if found else np.zeros(0)
+
+
+def _points_to_template(points: np.ndarray, vertices: np.ndarray, analysis: TemplateAnalysis) -> np.ndarray:
+    """Distance to the faces around each point's nearest template vertex, metres."""
+    used = np.unique(analysis.faces)
+    nearest = used[cKDTree(vertices[used]).query(points)[1]]
+    return fan_distances(points, nearest, vertices, analysis.faces, analysis.fan_offsets, analysis.fan_faces)
+
+
+def count_intersecting_faces(vertices: Float64[np.ndarray, "verts 3"], faces: np.ndarray) -> int:
+    """Faces that cut another face they share no vertex with."""
+    corners = vertices[faces]
+    centre = corners.mean(axis=1)
+    reach = np.sqrt(((corners - centre[:, None]) ** 2).sum(axis=2).max(axis=1))
+    radius = 2.0 * float(np.percentile(reach, 99))
+    pairs = cKDTree(centre, balanced_tree=False).query_pairs(radius, output_type="ndarray")
+    return int(intersecting_faces(vertices, faces, pairs).sum())
+
+
+def _judge(numbers: Mapping[str, float], faces: int, config: QualityConfig) -> tuple[Verdict, tuple[str, ...]]:
+    share = 100.0 / max(faces, 1)
+    limits = [
+        ("fit_mean_mm", numbers["fit_mean_mm"], config.fit_check_mm, config.fit_fail_mm, "mm"),
+        ("boundary_mean_mm", numbers["boundary_mean_mm"], config.boundary_check_mm, config.boundary_fail_mm, "mm"),
+        ("stretch_p99", numbers["stretch_p99"], config.stretch_check, config.stretch_fail, ""),
+        ("flipped faces", numbers["flipped_faces"] * share, config.flipped_check_percent, np.inf, "%"),
+        (
+            "self-intersecting faces", numbers["self_intersections"] * share,
+            config.intersections_check_percent, np.inf, "%",
+        ),
+    ]  # fmt: skip
+    failed = [f"{name} {value:.2f} > {fail:g} {unit}".rstrip() for name, value, _, fail, unit in limits if value > fail]
+    if numbers["covered_percent"] < config.min_covered_percent:
+        failed.append(f"scan data for {numbers['covered_percent']:.0f} % < {config.min_covered_percent:g} % of vertices")
+    if failed:
+        return "failed", tuple(failed)
+    check = [f"{name} {value:.2f} > {limit:g} {unit}".rstrip() for name, value, limit, _, unit in limits if value > limit]
+    return ("check", tuple(check)) if check else ("good", ())
+
+
+def _mean(values: np.ndarray) -> float:
+    return float(values.mean()) if len(values) else float("nan")
+
+
+def _percentile(values: np.ndarray, percent: float) -> float:
+    return float(np.percentile(values, percent)) if len(values) else float("nan")
+
+
+@njit(cache=True)
+def fan_distances(points, nearest, vertices, faces, fan_offsets, fan_faces):
+    """Distance of each point to the faces around one vertex (Ericson 2005, closest point on a triangle)."""
+    result = np.full(len(points), np.inf)
+    for n in range(len(points)):
+        for entry in range(fan_offsets[nearest[n]], fan_offsets[nearest[n] + 1]):
+            face = faces[fan_faces[entry]]
+            a, b, c, p = vertices[face[0]], vertices[face[1]], vertices[face[2]], points[n]
+            ab, ac, ap = b - a, c - a, p - a
+            d1, d2 = (ab * ap).sum(), (ac * ap).sum()
+            bp, cp = p - b, p - c
+            d3, d4 = (ab * bp).sum(), (ac * bp).sum()
+            d5, d6 = (ab * cp).sum(), (ac * cp).sum()
+            va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
+            if d1 <= 0 and d2 <= 0:
+                closest = a
+            elif d3 >= 0 and d4 <= d3:
+                closest = b
+            elif d6 >= 0 and d5 <= d6:
+                closest = c
+            elif vc <= 0 and d1 >= 0 and d3 <= 0:
+                closest = a + ab * (d1 / (d1 - d3))
+            elif vb <= 0 and d2 >= 0 and d6 <= 0:
+                closest = a + ac * (d2 / (d2 - d6))
+            elif va <= 0 and d4 - d3 >= 0 and d5 - d6 >= 0:
+                closest = b + (c - b) * ((d4 - d3) / ((d4 - d3) + (d5 - d6)))
+            else:
+                closest = a + ab * (vb / (va + vb + vc)) + ac * (vc / (va + vb + vc))
+            result[n] = min(result[n], np.sqrt(((p - closest) ** 2).sum()))
+    return result
+
+
+@njit(cache=True)
+def segment_cuts(start, end, a, b, c):
+    """Whether a segment passes through the inside of a triangle (Moeller and Trumbore 1997)."""
+    d, e1, e2, s = end - start, b - a, c - a, start - a
+    p = np.array([d[1] * e2[2] - d[2] * e2[1], d[2] * e2[0] - d[0] * e2[2], d[0] * e2[1] - d[1] * e2[0]])
+    det = (e1 * p).sum()
+    if abs(det) < 1e-18:
+        return False
+    u = (s * p).sum() / det
+    if u < 0.0 or u > 1.0:
+        return False
+    q = np.array([s[1] * e1[2] - s[2] * e1[1], s[2] * e1[0] - s[0] * e1[2], s[0] * e1[1] - s[1] * e1[0]])
+    v = (d * q).sum() / det
+    if v < 0.0 or u + v > 1.0:
+        return False
+    t = (e2 * q).sum() / det
+    return 0.0 <= t <= 1.0
+
+
+@njit(cache=True)
+def intersecting_faces(vertices, faces, pairs):
+    """Marks the faces of those pairs that cut each other and share no vertex."""
+    cut = np.zeros(len(faces), np.bool_)
+    for n in range(len(pairs)):
+        f, g = faces[pairs[n, 0]], faces[pairs[n, 1]]
+        apart = True
+        for i in range(3):
+            for j in range(3):
+                if f[i] == g[j]:
+                    apart = False
+        for axis in range(3):
+            if not apart:
+                break
+            low_f = min(vertices[f[0], axis], vertices[f[1], axis], vertices[f[2], axis])
+            high_f = max(vertices[f[0], axis], vertices[f[1], axis], vertices[f[2], axis])
+            low_g = min(vertices[g[0], axis], vertices[g[1], axis], vertices[g[2], axis])
+            high_g = max(vertices[g[0], axis], vertices[g[1], axis], vertices[g[2], axis])
+            if low_f > high_g or low_g > high_f:
+                apart = False
+        if not apart:
+            continue
+        for i in range(3):
+            j = (i + 1) % 3
+            if segment_cuts(vertices[f[i]], vertices[f[j]], vertices[g[0]], vertices[g[1]], vertices[g[2]]) or (
+                segment_cuts(vertices[g[i]], vertices[g[j]], vertices[f[0]], vertices[f[1]], vertices[f[2]])
+            ):
+                cut[pairs[n, 0]] = True
+                cut[pairs[n, 1]] = True
+                break
+    return cut

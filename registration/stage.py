@@ -1,0 +1,186 @@
+"""The registration stage: CAPTURE and WORK/garment in, WORK/registration out.
+
+    stage.json                what was run
+    garment.npz               the template
+    frames/000123.npz         vertices (V, 3) and residual_m (V,) float32, verdict (0 good, 1 check, 2 failed)
+    metrics/000123.json       the frame's numbers, reasons and CPU time
+    vertices.npy              (T, V, 3) float32, all frames
+    metrics.jsonl             the frames' metrics, one per line
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+
+import numpy as np
+
+from capture4d.garment_stage import load_garment_scan
+from capture4d.scans import load_garment, read_body, read_capture, read_poses, read_template, save_garment
+from capture4d.types import RegisteredSequence
+from capture4d.workdir import Stage, open_stage, read_json, require_complete, run_jobs, write_bytes, write_json, write_npz
+from registration.config import RegistrationConfig
+from registration.sequence import FrameResult, Mover, register_segment, segments
+from registration.template import TemplateAnalysis, analyse_template
+
+__all__ = ["load_registration", "run"]
+
+SCHEMA = 1
+VERDICTS = ("good", "check", "failed")
+
+
+@dataclass(frozen=True, slots=True)
+class SegmentJob:
+    """A run of frames for one worker."""
+
+    capture: Path
+    garment_folder: Path
+    stage: Stage
+    first_index: int
+    frame_ids: tuple[int, ...]
+
+
+def run(
+    capture: Path,
+    garment_folder: Path,
+    output: Path,
+    config: RegistrationConfig,
+    *,
+    workers: int = 1,
+    overwrite: bool = False,
+) -> str:
+    """Register the template to every frame that has none yet; the digest of the result.
+
+    Raises:
+        InputError: the capture or the garments are missing or unfinished, or poses, body and template disagree.
+    """
+    description = read_capture(capture)
+    command = f"capture4d extract {capture} --output {output.parent}"
+    digest = require_complete(garment_folder, "extract", command)
+    stage = open_stage(
+        output, name="register", schema=SCHEMA, config=config, upstream={"garment": digest}, overwrite=overwrite
+    )
+    garment = read_template(description)
+    if not (output / "garment.npz").is_file():
+        save_garment(output / "garment.npz", garment)
+    poses = read_poses(description)
+    posed = Mover.create(_light_analysis(capture, config), read_body(description), poses) is not None
+    pending = set(stage.pending(description.frame_ids))
+    runs = segments(description.frame_ids, length=config.sequence.segment, posed=posed)
+    jobs = []
+    index = 0
+    for frame_ids in runs:
+        if pending.intersection(frame_ids):
+            jobs.append(SegmentJob(capture, garment_folder, stage, index, frame_ids))
+        index += len(frame_ids)
+    for _ in run_jobs(
+        partial(_run_segment, config), jobs, workers=workers, label="register", units=lambda job: len(job.frame_ids),
+        finished=lambda: len(description.frame_ids) - len(stage.pending(description.frame_ids)),
+    ):  # fmt: skip
+        pass
+    return _collect(stage, description.frame_ids)
+
+
+def load_registration(folder: Path) -> RegisteredSequence:
+    """Read a finished registration; the vertices stay on disk until they are touched."""
+    garment = load_garment(folder / "garment.npz")
+    frame_ids = [int(path.stem) for path in sorted((folder / "frames").glob("*.npz"))]
+    residual = []
+    for frame_id in frame_ids:
+        with np.load(folder / "frames" / f"{frame_id:06d}.npz", allow_pickle=False) as arrays:
+            residual.append(arrays["residual_m"])
+    vertices = np.load(folder / "vertices.npy", mmap_mode="r", allow_pickle=False)
+    return RegisteredSequence(garment, vertices, np.array(residual, np.float32), np.array(frame_ids, np.int32))
+
+
+@lru_cache(maxsize=2)
+def _light_analysis(capture: Path, config: RegistrationConfig) -> TemplateAnalysis:
+    """One analysis per process, template and settings."""
+    return analyse_template(read_template(read_capture(capture)), config)
+
+
+def _run_segment(config: RegistrationConfig, job: SegmentJob) -> int:
+    """Register and write the frames of a segment; how many were new."""
+    description = read_capture(job.capture)
+    analysis = _light_analysis(job.capture, config)
+    mover = Mover.create(analysis, read_body(description), read_poses(description))
+    pending = set(job.stage.pending(job.frame_ids))
+
+    def done(frame_id: int) -> tuple[np.ndarray, bool] | None:
+        if frame_id in pending:
+            return None
+        with np.load(job.stage.frame_path(frame_id), allow_pickle=False) as arrays:
+            return arrays["vertices"], VERDICTS[int(arrays["verdict"])] != "failed"
+
+    results = register_segment(
+        analysis,
+        mover,
+        job.frame_ids,
+        job.first_index,
+        load=lambda frame_id: load_garment_scan(job.garment_folder / "frames" / f"{frame_id:06d}.npz", frame_id),
+        done=done,
+        config=config,
+    )
+    count = 0
+    for result in results:
+        _write_frame(job.stage, result)
+        count += 1
+    return count
+
+
+def _write_frame(stage: Stage, result: FrameResult) -> None:
+    """Metrics first: the frame counts as done once its npz is there."""
+    numbers = {key: value if math.isfinite(value) else None for key, value in result.quality.numbers.items()}
+    write_json(
+        _metrics_path(stage, result.frame_id),
+        {
+            "frame_id": result.frame_id,
+            "verdict": result.quality.verdict,
+            "reasons": list(result.quality.reasons),
+            **numbers,
+            "cpu_s": round(result.cpu_s, 4),
+            "started_from": result.started_from,
+            "iterations": result.linear_iterations,
+        },
+    )
+    write_npz(
+        stage.frame_path(result.frame_id),
+        vertices=result.vertices,
+        residual_m=result.quality.residual_m.astype(np.float32),
+        verdict=np.uint8(VERDICTS.index(result.quality.verdict)),
+    )
+
+
+def _metrics_path(stage: Stage, frame_id: int) -> Path:
+    return stage.frame_path(frame_id, ".json", folder="metrics")
+
+
+def _collect(stage: Stage, frame_ids: tuple[int, ...]) -> str:
+    """Stack the frames, gather the metrics, close the stage."""
+    _stack_vertices(stage, frame_ids)
+    lines = [json.dumps(read_json(_metrics_path(stage, frame_id))) for frame_id in frame_ids]
+    write_bytes(stage.path / "metrics.jsonl", ("\n".join(lines) + "\n").encode())
+    frames = [stage.frame_path(frame_id) for frame_id in frame_ids]
+    return stage.finish([stage.path / "garment.npz", stage.path / "vertices.npy", *frames])
+
+
+def _stack_vertices(stage: Stage, frame_ids: tuple[int, ...]) -> None:
+    """Write vertices.npy frame by frame, so that memory does not grow with the take."""
+
+    def frames() -> Iterator[np.ndarray]:
+        for frame_id in frame_ids:
+            with np.load(stage.frame_path(frame_id), allow_pickle=False) as arrays:
+                yield arrays["vertices"]
+
+    first = next(frames())
+    partial_path = stage.path / ".vertices.npy.partial"
+    stacked = np.lib.format.open_memmap(partial_path, "w+", np.float32, (len(frame_ids), *first.shape))
+    for row, vertices in enumerate(frames()):
+        stacked[row] = vertices
+    stacked.flush()
+    del stacked
+    partial_path.replace(stage.path / "vertices.npy")
