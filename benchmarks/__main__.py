@@ -32,7 +32,7 @@ class Outlet:
 
 def main(arguments: list[str]) -> int:
     modules = [module.name for module in pkgutil.iter_modules(benchmarks.__path__)]
-    names = [name for name in modules if name not in ("__main__", "metric")]
+    names = [name for name in modules if name not in ("__main__", "metric", "peers")]
     if not arguments or arguments[0] not in names:
         print(f"{__doc__}\nNAME is one of: {', '.join(names)}")
         return 0 if arguments in (["--help"], ["-h"]) else 2
@@ -52,6 +52,15 @@ def main(arguments: list[str]) -> int:
     for line in broken:
         print(f"gate: {line}", file=sys.stderr)
     return 1 if broken else 0
+
+
+def _names() -> list[str]:
+    """Modules with a `run`, found without importing them."""
+    sources = {
+        module.name: Path(benchmarks.__path__[0], f"{module.name}.py")
+        for module in pkgutil.iter_modules(benchmarks.__path__)
+    }
+    return [name for name, source in sources.items() if "\ndef run(" in source.read_text()]
 
 
 def _print_table(name: str, metrics: list[Metric], seconds: float) -> None:

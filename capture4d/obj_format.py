@@ -61,10 +61,11 @@ def read_obj(path: Path) -> MeshFile:
             raise InputError(f"{path}:{line}: {name} {indices[beyond[0]] + 1} does not exist, the file has {count}")
 
     coloured = bool(vertices) and all(len(vertex) == 6 for vertex in vertices)
-    table = np.array([vertex if coloured else vertex[:3] for vertex in vertices], np.float64).reshape(len(vertices), -1)
+    table = np.array([vertex if coloured else vertex[:3] for vertex in vertices], np.float64)
+    table = table.reshape(-1, 6 if coloured else 3)
     has_uv = len(texture_of) and (texture_of >= 0).all()
     corner_uv = np.array(texture, np.float64)[texture_of] if has_uv else None
-    mesh, polygon_sizes = polygon_mesh(table[:, :3].reshape(-1, 3), corner_of, size_of, corner_uv)
+    mesh, polygon_sizes = polygon_mesh(table[:, :3], corner_of, size_of, corner_uv)
     return MeshFile(mesh, colour_bytes(table[:, 3:]) if coloured else None, polygon_sizes)
 
 

@@ -314,6 +314,8 @@ def run_jobs(
     Raises:
         WorkerDied: a worker was killed.
     """
+    if not jobs:
+        return
     total = sum(units(job) if units else 1 for job in jobs)
     with _progress(label, total, finished) as advance:
         if workers <= 1 or len(jobs) <= 1:

@@ -63,6 +63,23 @@ class Demo(_Stage):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Extract(_Stage):
+    """Cut the garment out of every scan by its colour, and find its painted borders."""
+
+    capture: Positional[Path]
+    """Capture folder."""
+    output: Path
+    """Work folder; gets garment/."""
+
+    def __call__(self) -> int:
+        from capture4d.garment_stage import run
+
+        run(self.capture, self.output / "garment", workers=self.workers, overwrite=self.overwrite)
+        print(f"garment: {self.output / 'garment'}")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
 class Register(_Stage):
     """Register the template to every frame whose garment `extract` has cut out."""
 
@@ -149,6 +166,7 @@ class ConvertBody:
 
 _COMMANDS: Mapping[str, Any] = {
     "demo": Demo,
+    "extract": Extract,
     "register": Register,
     "run": Run,
     "report": Report,

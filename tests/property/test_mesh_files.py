@@ -1,0 +1,85 @@
+"""What is written is read back, whatever the mesh."""
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from capture4d.mesh import boundary_edges, boundary_loops, unique_edges
+from capture4d.mesh_files import read_mesh, write_mesh
+from capture4d.types import Mesh
+
+FLOATS = st.floats(-1e6, 1e6, width=32, allow_subnormal=False)
+Drawn = tuple[tuple[np.ndarray, np.ndarray, np.ndarray], np.ndarray, np.ndarray]
+
+
+@st.composite
+def drawings(draw: st.DrawFn) -> Drawn:
+    """Any polygons on any vertices, with UVs; colours; and the polygons' sizes."""
+    count = draw(st.integers(1, 12))
+    vertices = draw(hnp.arrays(np.float32, (count, 3), elements=FLOATS))
+    colours = draw(hnp.arrays(np.uint8, (count, 3)))
+    sizes = draw(hnp.arrays(np.int32, st.integers(1, 6), elements=st.integers(3, 7)))
+    faces, uv = [], []
+    for size in sizes:
+        corners = draw(hnp.arrays(np.int32, int(size), elements=st.integers(0, count - 1)))
+        texture = draw(hnp.arrays(np.float32, (int(size), 2), elements=FLOATS))
+        fan = np.array([[0, k + 1, k + 2] for k in range(size - 2)])
+        faces.append(corners[fan])
+        uv.append(texture[fan])
+    return (vertices, np.concatenate(faces), np.concatenate(uv)), colours, sizes
+
+
+@given(drawings(), st.sampled_from([".obj", ".ply"]))
+@settings(max_examples=60, deadline=None)
+def test_files_return_what_they_were_given(drawn: Drawn, suffix: str):
+    arrays, colours, sizes = drawn
+    mesh = Mesh(*arrays)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"mesh{suffix}"
+        write_mesh(path, mesh, colours=colours, polygon_sizes=sizes)
+        found = read_mesh(path)
+    np.testing.assert_array_equal(found.mesh.vertices, mesh.vertices)
+    np.testing.assert_array_equal(found.mesh.faces, mesh.faces)
+    np.testing.assert_array_equal(found.mesh.uv, mesh.uv)
+    found_sizes = np.full(len(mesh.faces), 3) if found.polygon_sizes is None else found.polygon_sizes
+    np.testing.assert_array_equal(found_sizes, sizes)
+    np.testing.assert_array_equal(found.colours, colours)
+
+
+@given(drawings())
+@settings(max_examples=20, deadline=None)
+def test_glb_keeps_the_numbering(drawn: Drawn):
+    arrays, colours, _ = drawn
+    mesh = Mesh(*arrays)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "mesh.glb"
+        write_mesh(path, mesh, colours=colours)
+        found = read_mesh(path)
+    np.testing.assert_array_equal(found.mesh.vertices, mesh.vertices)
+    np.testing.assert_array_equal(found.mesh.faces, mesh.faces)
+    np.testing.assert_array_equal(found.colours, colours)
+
+
+@given(st.data())
+@settings(max_examples=60, deadline=None)
+def test_loops_are_the_border_of_any_part_of_a_sheet(data: st.DataObject):
+    """On a consistently wound mesh, every border edge is in exactly one loop, and no loop repeats a vertex."""
+    side = 5
+    corner = (np.arange(side)[:, None] * (side + 1) + np.arange(side)).reshape(-1)
+    sheet = np.concatenate(
+        [
+            np.stack([corner, corner + 1, corner + side + 2], 1),
+            np.stack([corner, corner + side + 2, corner + side + 1], 1),
+        ]
+    ).astype(np.int32)
+    faces = sheet[data.draw(hnp.arrays(bool, len(sheet)))]
+    edges = sorted(map(tuple, boundary_edges(faces).tolist()))
+    loops = boundary_loops(faces)
+    walked = sorted(pair for loop in loops for pair in zip(loop.tolist(), np.roll(loop, -1).tolist(), strict=True))
+    assert walked == edges
+    assert all(len(set(loop.tolist())) == len(loop) for loop in loops)
+    assert len(edges) == 2 * len(unique_edges(faces)) - 3 * len(faces)

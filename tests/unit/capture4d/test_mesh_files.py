@@ -1,0 +1,139 @@
+"""Mesh files as other programs write them, and as they should not be."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from capture4d.errors import InputError
+from capture4d.mesh_files import read_mesh, write_mesh
+from capture4d.types import Mesh
+
+QUAD_AND_TRIANGLE = """\
+# two faces; a stray vertex; tabs, UV seam, comment
+v 0 0 0
+v\t1 0 0
+v 1 1 0
+v 0 1 0
+v 9 9 9
+v 2 0 0
+vt 0 0
+vt 1 0
+vt 1 1
+vt 0 1
+vt .5 .5
+f 1/1/1 2/2/1 3/3/1 4/4/1
+f -5/5 -1/2 -4/3
+"""
+
+
+def test_obj_keeps_vertices_polygons_and_corner_uvs(tmp_path: Path):
+    path = tmp_path / "quad.obj"
+    path.write_text(QUAD_AND_TRIANGLE)
+    found = read_mesh(path)
+    assert len(found.mesh.vertices) == 6  # nothing split at the seam, nothing dropped
+    assert found.mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3], [1, 5, 2]]
+    assert found.polygon_sizes is not None
+    assert found.polygon_sizes.tolist() == [4, 3]
+    assert found.mesh.uv is not None
+    assert found.mesh.uv[1].tolist() == [[0, 0], [1, 1], [0, 1]]
+    assert found.mesh.uv[2].tolist() == [[0.5, 0.5], [1, 0], [1, 1]]
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".ply"])
+def test_polygons_and_uvs_survive_writing(tmp_path: Path, suffix: str):
+    source, copy = tmp_path / "quad.obj", tmp_path / f"copy{suffix}"
+    source.write_text(QUAD_AND_TRIANGLE)
+    first = read_mesh(source)
+    write_mesh(copy, first.mesh, polygon_sizes=first.polygon_sizes)
+    again = read_mesh(copy)
+    np.testing.assert_array_equal(again.mesh.vertices, first.mesh.vertices)
+    np.testing.assert_array_equal(again.mesh.faces, first.mesh.faces)
+    np.testing.assert_array_equal(again.mesh.uv, first.mesh.uv)
+    np.testing.assert_array_equal(again.polygon_sizes, first.polygon_sizes)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("v 0 0 0\nv 1 0 zero\n", "bad.obj:2: expected numbers"),
+        ("v 0 0 0\nv 1 nan 0\n", "bad.obj:2: expected finite"),
+        ("v 0 0\n", "bad.obj:1: expected at least 3 numbers"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\n\nf 1 2 4\n", "bad.obj:5: vertex 4 does not exist"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n", "bad.obj:4: expected an index from 1"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf -4 1 2\n", "bad.obj:4: expected an index"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1/7 2/7 3/7\n", "bad.obj:4: texture coordinate 7 does not exist"),
+        ("v 0 0 0\nv 1 0 0\nf 1 2\n", "bad.obj:3: expected a face of at least 3 corners"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\n", "bad.obj: empty mesh, found 3 vertices and no faces"),
+        ("", "bad.obj: empty mesh"),
+    ],
+)
+def test_a_wrong_obj_names_the_line(tmp_path: Path, text: str, expected: str):
+    path = tmp_path / "bad.obj"
+    path.write_text(text)
+    with pytest.raises(InputError) as caught:
+        read_mesh(path)
+    assert expected in str(caught.value)
+    assert str(caught.value).count(str(tmp_path)) == 1
+
+
+def test_ply_as_text_with_doubles_and_mixed_faces(tmp_path: Path):
+    path = tmp_path / "text.ply"
+    path.write_text(
+        "ply\nformat ascii 1.0\ncomment made by hand\nelement vertex 5\nproperty double x\nproperty double y\n"
+        "property double z\nproperty uchar red\nproperty uchar green\nproperty uchar blue\nproperty uchar alpha\n"
+        "element face 2\nproperty list uchar uint vertex_index\nend_header\n"
+        "0 0 0 255 0 0 255\n1 0 0 0 255 0 255\n1 1 0 0 0 255 255\n0 1 0 9 9 9 255\n2 0 0 1 2 3 255\n"
+        "4 0 1 2 3\n3 1 4 2\n"
+    )
+    found = read_mesh(path)
+    assert found.mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3], [1, 4, 2]]
+    assert found.colours is not None
+    assert found.colours[4].tolist() == [1, 2, 3]
+
+
+def test_ply_big_endian_with_windows_line_ends(tmp_path: Path):
+    path = tmp_path / "big.ply"
+    header = (
+        "ply\r\nformat binary_big_endian 1.0\r\nelement vertex 3\r\nproperty float x\r\nproperty float y\r\n"
+        "property float z\r\nelement face 1\r\nproperty list uchar int vertex_indices\r\nend_header\r\n"
+    )
+    path.write_bytes(header.encode() + struct.pack(">9f", 0, 0, 0, 1, 0, 0, 0, 1, 0.5) + struct.pack(">B3i", 3, 0, 1, 2))
+    found = read_mesh(path)
+    assert found.mesh.vertices.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0.5]]
+    assert found.mesh.faces.tolist() == [[0, 1, 2]]
+
+
+def test_a_ply_cut_off_anywhere_is_one_clear_error(tmp_path: Path):
+    rng = np.random.default_rng(0)
+    mesh = Mesh(rng.random((30, 3), np.float32), rng.integers(0, 30, (50, 3)).astype(np.int32))
+    whole, cut = tmp_path / "whole.ply", tmp_path / "cut.ply"
+    write_mesh(whole, mesh, colours=rng.integers(0, 255, (30, 3)).astype(np.uint8))
+    data = whole.read_bytes()
+    for length in range(len(data)):
+        cut.write_bytes(data[:length])
+        with pytest.raises(InputError, match=r"cut\.ply: ") as caught:
+            read_mesh(cut)
+        assert "\n" not in str(caught.value)
+
+
+def test_damaged_and_missing_files_are_named(tmp_path: Path):
+    glb = tmp_path / "broken.glb"
+    glb.write_bytes(b"glTF\x02\x00\x00\x00")
+    for path, expected in (
+        (glb, "broken.glb: not a readable GLB"),
+        (tmp_path / "none.ply", "none.ply: no such mesh file"),
+        (tmp_path / "scan.fbx", "scan.fbx: expected a mesh file"),
+    ):
+        with pytest.raises(InputError, match=expected):
+            read_mesh(path)
+
+
+def test_nan_in_a_ply_is_named(tmp_path: Path):
+    path = tmp_path / "nan.ply"
+    write_mesh(path, Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32)))
+    head, body = path.read_bytes().split(b"end_header\n")
+    path.write_bytes(head + b"end_header\n" + struct.pack("<f", np.nan) + body[4:])
+    with pytest.raises(InputError, match=r"nan\.ply: Mesh\.vertices: expected finite numbers"):
+        read_mesh(path)
