@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
+from numba import njit
 
 from capture4d.mesh import vertex_normals
 from capture4d.open3d_loading import import_open3d
@@ -74,26 +75,29 @@ class SurfaceScene:
         within = np.arange(TILE)
         v = np.broadcast_to((rows[:, None, None] * TILE + within[:, None]), (len(rows), TILE, TILE)).ravel()
         u = np.broadcast_to((columns[:, None, None] * TILE + within), (len(rows), TILE, TILE)).ravel()
+        inside = (v < height) & (u < width)
+        v, u = v[inside], u[inside]
+        shape = min(shape[0], height - top), min(shape[1], width - left)
         rays = _rays(rig, camera, u.astype(np.float32), v.astype(np.float32))
         answer = self._scene.cast_rays(_tensor(rays), nthreads=1)
-        t_hit = answer["t_hit"].numpy()
-        hit = np.flatnonzero(np.isfinite(t_hit))
-        pixel = (v[hit] - top) * shape[1] + (u[hit] - left)
-        surface = answer["geometry_ids"].numpy()[hit]
-        face = answer["primitive_ids"].numpy()[hit] + self._first_face[surface]
-        corners = self._corner_colours[face]
-        second, third = answer["primitive_uvs"].numpy()[hit].T[:, :, None]
-        colours = corners[:, 0] + second * (corners[:, 1] - corners[:, 0]) + third * (corners[:, 2] - corners[:, 0])
-        directions = rays[hit, 3:]
-        normals = answer["primitive_normals"].numpy()[hit]
-        cosine = -np.einsum("ij,ij->i", directions, normals) / np.linalg.norm(directions, axis=1)
-        return CameraImages(
-            depth=_image(shape, pixel, t_hit[hit]),
-            cosine=_image(shape, pixel, cosine),
-            surface=_image(shape, pixel, surface.astype(np.uint8), fill=NOTHING),
-            colours=_image(shape, pixel, colours),
-            origin=(int(top), int(left)),
+        depth, cosine = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+        surface, colours = np.full(shape, NOTHING, np.uint8), np.zeros((*shape, 3), np.float32)
+        _fill_images(
+            depth,
+            cosine,
+            surface,
+            colours,
+            (v - top, u - left),
+            rays,
+            answer["t_hit"].numpy(),
+            answer["geometry_ids"].numpy(),
+            answer["primitive_ids"].numpy(),
+            answer["primitive_uvs"].numpy(),
+            answer["primitive_normals"].numpy(),
+            self._first_face,
+            self._corner_colours,
         )
+        return CameraImages(depth, cosine, surface, colours, origin=(int(top), int(left)))
 
     def _occupied_tiles(self, rig: Rig, camera: int, width: int, height: int) -> Bool[np.ndarray, "rows columns"]:
         """Tiles whose centre, or a neighbour's, hits something."""
@@ -126,10 +130,28 @@ def _rays(rig: Rig, camera: int, u: np.ndarray, v: np.ndarray) -> Float32[np.nda
     return rays
 
 
-def _image(shape: tuple[int, int], pixel: np.ndarray, values: np.ndarray, fill: int = 0) -> np.ndarray:
-    image = np.full((shape[0] * shape[1], *values.shape[1:]), fill, values.dtype)
-    image[pixel] = values
-    return image.reshape(*shape, *values.shape[1:])
+@no_type_check  # keeps the type-checking import hook off the function that numba compiles
+@njit(cache=True)
+def _fill_images(
+    depth, cosine, surface, colours, pixels, rays, t_hit, surface_ids, face_ids, uv, normals, first_face, corner_colours
+):
+    """Scatter the hits of rays to the pixels (rows, columns) they went through."""
+    for ray in range(len(rays)):
+        if not np.isfinite(t_hit[ray]):
+            continue
+        row, column = pixels[0][ray], pixels[1][ray]
+        direction, normal = rays[ray, 3:], normals[ray]
+        length = np.sqrt(direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2)
+        toward = direction[0] * normal[0] + direction[1] * normal[1] + direction[2] * normal[2]
+        depth[row, column] = t_hit[ray]
+        cosine[row, column] = -toward / length
+        surface[row, column] = surface_ids[ray]
+        corners = corner_colours[first_face[surface_ids[ray]] + face_ids[ray]]
+        second, third = uv[ray, 0], uv[ray, 1]
+        for channel in range(3):
+            colours[row, column, channel] = (
+                (1 - second - third) * corners[0, channel] + second * corners[1, channel] + third * corners[2, channel]
+            )
 
 
 def _tensor(array: np.ndarray) -> Any:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from jaxtyping import Float64
 
@@ -24,12 +22,14 @@ RINGS: tuple[tuple[str, float, float, float, float], ...] = (
 )
 
 
-def look_at(eye: Sequence[float] | np.ndarray, target: Sequence[float] | np.ndarray) -> Float64[np.ndarray, "4 4"]:
+def look_at(eye: tuple[float, float, float] | np.ndarray, target: tuple[float, float, float] | np.ndarray) -> Float64[np.ndarray, "4 4"]:
     """T_camera_world of a camera at `eye` with its z axis towards `target` and world Y up in the image (image y down)."""
     eye, target = np.asarray(eye, float), np.asarray(target, float)
     forward = target - eye
-    forward /= np.linalg.norm(forward)
     right = np.cross(forward, (0.0, 1.0, 0.0))
+    if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(forward):
+        raise InputError(f"look_at: a vertical view has no upright image, found eye {eye} and target {target}")
+    forward /= np.linalg.norm(forward)
     right /= np.linalg.norm(right)
     transform = np.eye(4)
     transform[:3, :3] = right, np.cross(forward, right), forward
@@ -46,7 +46,7 @@ def bounding_sphere(points: np.ndarray) -> tuple[np.ndarray, float]:
 
 def capture_rig(
     *,
-    centre: Sequence[float] | np.ndarray = (0.0, 1.2, 0.0),
+    centre: tuple[float, float, float] | np.ndarray = (0.0, 1.2, 0.0),
     radius: float = 0.55,
     cameras: int = 48,
     image_size: int = 512,
