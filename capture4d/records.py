@@ -150,16 +150,19 @@ class ArrayFile:
 
     def __enter__(self) -> ArrayFile:
         try:
-            self._file = np.load(self._path, allow_pickle=False)
-            self._names = self._file.files
+            self._stream = self._path.open("rb")
         except FileNotFoundError:
             raise InputError(f"{self._path}: no such file") from None
+        try:
+            self._arrays = np.load(self._stream, allow_pickle=False)
+            self._names = self._arrays.files
         except (ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+            self._stream.close()
             raise InputError(f"{self._path}: not a readable npz file, cut off or damaged ({error})") from None
         return self
 
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
-        self._file.close()
+        self._stream.close()
         if isinstance(error, InputError) and not str(error).startswith(str(self._path)):
             raise InputError(f"{self._path}: {error}") from None
 
@@ -167,7 +170,7 @@ class ArrayFile:
         if name not in self._names:
             raise InputError(f"{self._path}: expected an array '{name}', found {', '.join(self._names) or 'none'}")
         try:
-            return self._file[name]
+            return self._arrays[name]
         except (ValueError, EOFError, zipfile.BadZipFile) as error:
             raise InputError(f"{self._path}: damaged array '{name}' ({error})") from None
 

@@ -104,8 +104,6 @@ class Capture:
             raise InputError(f"{self.path}: expected a positive frame rate, found {self.fps}")
         if list(self.frame_ids) != sorted(set(self.frame_ids)) or self.frame_ids[0] < 0:
             raise InputError(f"{self.path}: expected ascending frame numbers, each once and none negative")
-        if self.units not in _METRES:
-            raise InputError(f"{self.path}: expected units {', '.join(get_args(Units))}, found '{self.units}'")
 
     def time_s(self, frame_id: int) -> float:
         """Time of a frame since the first."""
@@ -149,6 +147,13 @@ def parse_colour(text: str) -> Colour:
     return red, green, blue
 
 
+def _parse_units(text: str) -> Units:
+    for units in get_args(Units):
+        if text == units:
+            return units
+    raise InputError(f"expected units {', '.join(get_args(Units))}, found '{text}'")
+
+
 def format_colour(colour: Colour) -> str:
     return "#{:02x}{:02x}{:02x}".format(*colour)
 
@@ -177,7 +182,7 @@ def read_capture(path: str | Path) -> Capture:
             frame_ids=tuple(int(frame_id) for frame_id in found.get("frames") or sorted(present)),
             garment_colour=parse_colour(found["garment_colour"]),
             boundary_colours={name: parse_colour(text) for name, text in found.get("boundary_colours", {}).items()},
-            units=found.get("units", "m"),
+            units=_parse_units(found.get("units", "m")),
         )
     except InputError as error:
         raise InputError(f"{description}: {str(error).removeprefix(f'{path}: ')}") from None

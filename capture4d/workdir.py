@@ -41,8 +41,10 @@ __all__ = [
     "require_complete",
     "run_jobs",
     "write_bytes",
+    "write_chunks",
     "write_json",
     "write_npy",
+    "write_npy_rows",
     "write_npz",
 ]
 
@@ -61,13 +63,19 @@ def write_bytes(path: str | Path, data: bytes) -> None:
     Raises:
         OSError: the disk is full or read-only; names the file. What stood at `path` before still stands.
     """
+    write_chunks(path, [data])
+
+
+def write_chunks(path: str | Path, chunks: Iterable[bytes | memoryview]) -> None:
+    """`write_bytes` for more than memory should hold at once."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=_TEMPORARY_SUFFIX, dir=path.parent)
         try:
             with os.fdopen(handle, "wb") as file:
-                file.write(data)
+                for chunk in chunks:
+                    file.write(chunk)
                 file.flush()
                 os.fsync(file.fileno())
             os.chmod(temporary, 0o666 & ~_UMASK)
@@ -99,6 +107,23 @@ def write_npy(path: str | Path, array: np.ndarray) -> None:
     buffer = io.BytesIO()
     np.save(buffer, array, allow_pickle=False)
     write_bytes(path, buffer.getvalue())
+
+
+def write_npy_rows(path: str | Path, rows: Iterable[np.ndarray], *, count: int) -> None:
+    """Write one array of `count` rows of equal shape and type, atomically, holding one row in memory at a time."""
+
+    def chunks() -> Iterator[bytes | memoryview]:
+        for index, row in enumerate(rows):
+            if index == 0:
+                header = io.BytesIO()
+                described = np.lib.format.header_data_from_array_1_0(row)
+                np.lib.format.write_array_header_1_0(
+                    header, {**described, "fortran_order": False, "shape": (count, *row.shape)}
+                )
+                yield header.getvalue()
+            yield np.ascontiguousarray(row).tobytes()
+
+    write_chunks(path, chunks())
 
 
 def write_npz(path: str | Path, **arrays: Any) -> None:

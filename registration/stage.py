@@ -22,7 +22,17 @@ import numpy as np
 from capture4d.garment_stage import load_garment_scan
 from capture4d.scans import load_garment, read_body, read_capture, read_poses, read_template, save_garment
 from capture4d.types import RegisteredSequence
-from capture4d.workdir import Stage, open_stage, read_json, require_complete, run_jobs, write_bytes, write_json, write_npz
+from capture4d.workdir import (
+    Stage,
+    open_stage,
+    read_json,
+    require_complete,
+    run_jobs,
+    write_bytes,
+    write_json,
+    write_npy_rows,
+    write_npz,
+)
 from registration.config import RegistrationConfig
 from registration.sequence import FrameResult, Mover, register_segment, segments
 from registration.template import TemplateAnalysis, analyse_template
@@ -176,11 +186,4 @@ def _stack_vertices(stage: Stage, frame_ids: tuple[int, ...]) -> None:
             with np.load(stage.frame_path(frame_id), allow_pickle=False) as arrays:
                 yield arrays["vertices"]
 
-    first = next(frames())
-    partial_path = stage.path / ".vertices.npy.partial"
-    stacked = np.lib.format.open_memmap(partial_path, "w+", np.float32, (len(frame_ids), *first.shape))
-    for row, vertices in enumerate(frames()):
-        stacked[row] = vertices
-    stacked.flush()
-    del stacked
-    partial_path.replace(stage.path / "vertices.npy")
+    write_npy_rows(stage.path / "vertices.npy", frames(), count=len(frame_ids))

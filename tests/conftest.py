@@ -1,7 +1,46 @@
-"""Array shapes and types are checked on every call while tests run, and only then."""
+"""Array shapes and types are checked on every call while tests run, and only then; and a capture to test with."""
 
+from pathlib import Path
+
+import numpy as np
+import pytest
 from jaxtyping import install_import_hook
 
 install_import_hook(
     ["capture4d", "data_synth", "registration", "retarget", "wrinkles", "benchmarks"], "beartype.beartype"
 )
+
+
+@pytest.fixture
+def tube_capture(tmp_path: Path) -> Path:
+    """Three frames of a blue tube of cloth, 0.6 m long, that bends; its two borders are painted yellow.
+
+    No body, no poses; the template is the same tube, unbent, with a tenth of the vertices.
+    """
+    from capture4d.mesh import boundary_loops
+    from capture4d.scans import Capture, save_garment, write_capture_description, write_scan
+    from capture4d.types import Garment, Mesh, Scan
+
+    def tube(around: int, along: int, bend_m: float) -> Mesh:
+        angle = np.tile(2 * np.pi * np.arange(around) / around, along)
+        height = np.repeat(np.linspace(0, 0.6, along), around)
+        shift = bend_m * (height / 0.6) ** 2
+        vertices = np.stack([0.15 * np.sin(angle) + shift, height, 0.15 * np.cos(angle)], axis=1)
+        row, column = np.divmod(np.arange(around * (along - 1)), around)
+        a, b = row * around + column, row * around + (column + 1) % around
+        faces = np.concatenate([np.stack([a, b, b + around], 1), np.stack([a, b + around, a + around], 1)])
+        return Mesh(vertices.astype(np.float32), faces.astype(np.int32))
+
+    folder = tmp_path / "capture"
+    paint = {"neck": (255, 210, 0), "hem": (255, 210, 0)}
+    capture = Capture(folder, "tube", 60.0, (5, 6, 7), (47, 98, 201), paint)
+    for frame_id in capture.frame_ids:
+        mesh = tube(90, 80, 0.01 * (frame_id - 4))
+        painted = (mesh.vertices[:, 1] < 0.012) | (mesh.vertices[:, 1] > 0.588)
+        colours = np.where(painted[:, None], paint["hem"], capture.garment_colour).astype(np.uint8)
+        write_scan(folder / "scans" / f"{frame_id:06d}.ply", Scan(mesh, colours, frame_id, capture.time_s(frame_id)))
+    template = tube(36, 20, 0.0)
+    hem, neck = sorted(boundary_loops(template.faces), key=lambda loop: template.vertices[loop, 1].mean())
+    save_garment(folder / "template.npz", Garment(template, {"hem": hem, "neck": neck}))
+    write_capture_description(capture)
+    return folder

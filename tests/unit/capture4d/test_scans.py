@@ -1,0 +1,245 @@
+"""The capture folder: what is written is read, and what is wrong is named."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from capture4d.errors import InputError
+from capture4d.mesh_files import write_mesh
+from capture4d.scans import (
+    Capture,
+    TruthFrame,
+    TruthModel,
+    capture_digest,
+    format_colour,
+    load_body,
+    load_garment,
+    load_rig,
+    parse_colour,
+    read_capture,
+    read_poses,
+    read_scan,
+    read_template,
+    read_truth_frame,
+    read_truth_model,
+    read_truth_vertices,
+    save_body,
+    save_garment,
+    save_poses,
+    save_rig,
+    write_capture_description,
+    write_scan,
+    write_truth_frame,
+    write_truth_model,
+)
+from capture4d.types import Body, Garment, Mesh, PoseSequence, Rig, Scan
+
+FRAMES = (11, 12, 15)
+SQUARE = Mesh(
+    np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32), np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+)
+COLOURS = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [9, 8, 7]], np.uint8)
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Capture:
+    made = Capture(tmp_path, "take", 60.0, FRAMES, (47, 98, 201), {"neck": (255, 210, 0)})
+    for frame_id in FRAMES:
+        write_scan(tmp_path / "scans" / f"{frame_id:06d}.ply", Scan(SQUARE, COLOURS, frame_id, made.time_s(frame_id)))
+    write_capture_description(made)
+    return made
+
+
+def poses_of(frames: tuple[int, ...]) -> PoseSequence:
+    count = len(frames)
+    return PoseSequence(
+        rotations=np.tile(np.eye(3, dtype=np.float32), (count, 2, 1, 1)),
+        translations=np.arange(3 * count, dtype=np.float32).reshape(count, 3),
+        shape=np.zeros(4, np.float32),
+        frame_ids=np.array(frames, np.int32),
+        fps=60.0,
+        joint_names=("root", "head"),
+    )
+
+
+def test_a_capture_and_its_scans_come_back(capture: Capture):
+    found = read_capture(capture.path)
+    assert (found.name, found.fps, found.frame_ids, found.garment_colour) == ("take", 60.0, FRAMES, (47, 98, 201))
+    assert dict(found.boundary_colours) == {"neck": (255, 210, 0)}
+    scan = read_scan(found, 15)
+    np.testing.assert_array_equal(scan.mesh.vertices, SQUARE.vertices)
+    np.testing.assert_array_equal(scan.colours, COLOURS)
+    assert scan.time_s == pytest.approx(4 / 60)
+
+
+def test_frames_may_be_left_to_the_files(capture: Capture):
+    edit_description(capture, lambda entries: entries.pop("frames"))
+    assert read_capture(capture.path).frame_ids == FRAMES
+
+
+def test_millimetres_become_metres(capture: Capture):
+    in_mm = replace(capture, units="mm")
+    np.testing.assert_allclose(read_scan(in_mm, 11).mesh.vertices, SQUARE.vertices / 1000)
+
+
+def test_colours_round_trip():
+    assert parse_colour("#2f62c9") == parse_colour("2F62C9") == (47, 98, 201)
+    assert format_colour((47, 98, 201)) == "#2f62c9"
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (lambda entries: entries.pop("fps"), "expected the entry 'fps'"),
+        (lambda entries: entries.update(fps=0), "expected a positive frame rate, found 0"),
+        (lambda entries: entries.update(fps="fast"), "could not convert"),
+        (lambda entries: entries.update(format=7), "expected format 1, found 7"),
+        (lambda entries: entries.update(units="inch"), "expected units m, cm, mm, found 'inch'"),
+        (lambda entries: entries.update(garment_colour="blue"), "expected a colour such as #2f62c9, found 'blue'"),
+        (lambda entries: entries.update(frames=[12, 11]), "expected ascending frame numbers"),
+        (lambda entries: entries.update(boundary_colours=[1]), "capture.json"),
+    ],
+)
+def test_a_wrong_description_names_file_and_entry(capture: Capture, edit: Callable[[dict], object], message: str):
+    edit_description(capture, edit)
+    with pytest.raises(InputError) as caught:
+        read_capture(capture.path)
+    assert "capture.json: " in str(caught.value)
+    assert message in str(caught.value)
+
+
+def edit_description(capture: Capture, edit: Callable[[dict], object]) -> None:
+    path = capture.path / "capture.json"
+    entries = json.loads(path.read_text())
+    edit(entries)
+    path.write_text(json.dumps(entries))
+
+
+def test_what_is_missing_is_named(capture: Capture, tmp_path: Path):
+    (capture.path / "scans" / "000012.ply").unlink()
+    with pytest.raises(InputError, match=r"000012\.ply: no such scan; 1 of 3 frames"):
+        read_capture(capture.path)
+    with pytest.raises(InputError, match="no such capture folder"):
+        read_capture(tmp_path / "nowhere")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match=r"capture\.json: no such file"):
+        read_capture(tmp_path / "empty")
+    with pytest.raises(InputError, match=r"template\.npz: no such file"):
+        read_template(capture)
+
+
+def test_a_scan_without_colours_is_named(capture: Capture):
+    write_mesh(capture.path / "scans" / "000012.ply", SQUARE)
+    with pytest.raises(InputError, match=r"000012\.ply: expected a colour per vertex"):
+        read_scan(capture, 12)
+
+
+def test_poses_come_in_the_order_of_the_scans(capture: Capture):
+    assert read_poses(capture) is None
+    save_poses(capture.path / "poses.npz", poses_of((15, 11, 99, 12)))
+    poses = read_poses(capture)
+    assert poses is not None
+    assert poses.frame_ids.tolist() == list(FRAMES)
+    assert poses.translations[:, 0].tolist() == [3, 9, 0]
+    assert poses.joint_names == ("root", "head")
+
+
+def test_poses_that_do_not_match_the_scans_are_named(capture: Capture):
+    save_poses(capture.path / "poses.npz", poses_of((11, 12, 13)))
+    with pytest.raises(InputError, match=r"poses\.npz: expected a pose for each of 3 scans.*frame 15 first"):
+        read_poses(capture)
+
+
+def test_the_digest_follows_what_a_stage_reads(capture: Capture):
+    before = capture_digest(capture)
+    assert capture_digest(read_capture(capture.path)) == before
+    save_poses(capture.path / "poses.npz", poses_of(FRAMES))
+    after_poses = capture_digest(capture)
+    write_mesh(capture.path / "scans" / "000012.ply", SQUARE)  # another size
+    assert len({before, after_poses, capture_digest(capture)}) == 3
+
+
+def test_bodies_garments_and_rigs_come_back(tmp_path: Path):
+    rng = np.random.default_rng(0)
+    weights = rng.random((4, 2), np.float32)
+    weights /= weights.sum(axis=1, keepdims=True)
+    body = Body(
+        template=SQUARE,
+        shape_directions=rng.random((3, 4, 3), np.float32),
+        joints=rng.random((2, 3), np.float32),
+        joint_directions=rng.random((3, 2, 3), np.float32),
+        joint_names=("root", "tête"),
+        parents=np.array([-1, 0], np.int32),
+        skin_weights=weights,
+        regions=np.array([0, 1, 2, 3], np.uint8),
+    )
+    garment = Garment(
+        Mesh(SQUARE.vertices, SQUARE.faces, rng.random((2, 3, 2), np.float32)),
+        {"hem": np.array([0, 1], np.int32), "cuff_left": np.array([2], np.int32)},
+        skin_weights=weights,
+    )
+    rig = Rig(("a", "b"), rng.random((2, 3, 3)), np.zeros((2, 5)), rng.random((2, 4, 4)), np.full((2, 2), 512, np.int32))
+    save_body(tmp_path / "body.npz", body)
+    save_garment(tmp_path / "garment.npz", garment)
+    save_rig(tmp_path / "rig.json", rig)
+    for made, found in (
+        (body, load_body(tmp_path / "body.npz")),
+        (garment, load_garment(tmp_path / "garment.npz")),
+        (rig, load_rig(tmp_path / "rig.json")),
+    ):
+        assert_equal(made, found)
+
+
+def assert_equal(made, found) -> None:
+    """Every field alike, to the bit."""
+    if hasattr(made, "__dataclass_fields__"):
+        for name in made.__dataclass_fields__:
+            assert_equal(getattr(made, name), getattr(found, name))
+    elif isinstance(made, dict):
+        assert made.keys() == found.keys()
+        for key in made:
+            assert_equal(made[key], found[key])
+    elif isinstance(made, np.ndarray):
+        assert made.dtype == found.dtype
+        np.testing.assert_array_equal(made, found)
+    else:
+        assert made == found
+
+
+def test_truth_comes_back(capture: Capture):
+    assert read_truth_model(capture) is None
+    model = TruthModel(SQUARE, {"hem": np.array([0, 1], np.int32)}, np.zeros(5, np.int32), np.full((5, 3), 1 / 3, "f4"))
+    frame = TruthFrame(
+        SQUARE.vertices, np.eye(3, dtype=np.float32)[None], np.zeros(3, np.float32), np.zeros(4, np.uint8)
+    )
+    write_truth_model(capture.path / "truth" / "model.npz", model)
+    write_truth_frame(capture.path / "truth" / "000011.npz", frame)
+    assert_equal(model, read_truth_model(capture))
+    assert_equal(frame, read_truth_frame(capture, 11))
+    np.testing.assert_array_equal(read_truth_vertices(capture, 11), SQUARE.vertices)
+    with pytest.raises(InputError, match=r"000012\.npz: no such file"):
+        read_truth_frame(capture, 12)
+
+
+def test_a_damaged_or_foreign_archive_is_named(tmp_path: Path):
+    path = tmp_path / "body.npz"
+    path.write_bytes(b"PK\x03\x04 not really")
+    with pytest.raises(InputError, match=r"body\.npz: not a readable npz file"):
+        load_body(path)
+    np.savez(path, template_vertices=SQUARE.vertices)
+    with pytest.raises(InputError, match=r"body\.npz: expected an array 'template_faces'"):
+        load_body(path)
+    np.savez(path, template_vertices=np.array([object()]))
+    with pytest.raises(InputError, match=r"body\.npz: damaged array 'template_vertices'"):
+        load_body(path)
+
+
+def test_a_bare_mesh_is_a_template_with_its_loops(capture: Capture):
+    write_mesh(capture.path / "template.obj", SQUARE)
+    garment = read_template(capture)
+    assert {name: len(loop) for name, loop in garment.loops.items()} == {"border_0": 4}
+    assert garment.skin_weights is None
