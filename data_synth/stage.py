@@ -1,0 +1,332 @@
+"""The synthetic scanner as a stage: a configuration in, a capture folder with its truth out."""
+
+from __future__ import annotations
+
+import json
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from capture4d.body import PosedBody, ShapedBody, pose_frame, with_shape
+from capture4d.body_anny import load_anny
+from capture4d.records import load_rig, save_body, save_garment, save_poses, save_rig
+from capture4d.scans import (
+    Capture,
+    TruthFrame,
+    TruthModel,
+    write_capture_description,
+    write_scan,
+    write_truth_frame,
+    write_truth_model,
+)
+from capture4d.types import Mesh, PoseSequence, Rig
+from capture4d.workdir import Stage, open_stage, run_jobs, write_json, write_npz
+from data_synth.cloth_quality import measure_cloth
+from data_synth.config import FABRICS, SynthConfig
+from data_synth.motions import make_motion
+from data_synth.patterns import PanelMesh, Pattern, locate, mesh_pattern, tshirt_pattern
+from data_synth.rig import bounding_sphere, capture_rig
+from data_synth.scanner import LABEL_BODY, LABEL_GARMENT, Surface, scan_surfaces
+from data_synth.simulation import approach_poses, dress, simulate
+from data_synth.template import bind_template, carry
+from data_synth.wrinkle_relaxation import WrinkleMesh, relax_frame, wrinkle_mesh
+
+__all__ = ["Take", "prepare_take", "run", "simulate_take"]
+
+SCHEMA = 1
+GARMENT_COLOUR, BORDER_COLOUR = (47, 98, 201), (255, 196, 0)
+SUIT_COLOUR, SKIN_COLOUR = (150, 152, 156), (214, 168, 140)
+BORDER_BAND_M = 0.009
+"""Width of the painted border."""
+RIG_RADIUS_M = 0.62
+"""Smallest sphere the rig is set up for: the upper body with room for the garment."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Take:
+    """All that is known before anything is simulated."""
+
+    config: SynthConfig
+    shaped: ShapedBody
+    poses: PoseSequence
+    """The captured frames."""
+    bodies: list[PosedBody]
+    """Every simulated frame: the approach, then the clip."""
+    pattern: Pattern
+    coarse: PanelMesh
+    fine: PanelMesh
+    template: PanelMesh
+    wrinkles: WrinkleMesh
+
+    @property
+    def lead(self) -> int:
+        """Simulated frames before the clip."""
+        simulation = self.config.simulation
+        return simulation.calm_frames + simulation.approach_frames + simulation.rest_frames
+
+
+def prepare_take(config: SynthConfig) -> Take:
+    """Body, motion and meshes of a configuration. Each random part has its own stream of the one seed."""
+    streams = {
+        name: np.random.default_rng([config.seed, number])
+        for number, name in enumerate(("motion", "coarse", "fine", "template", "imperfection"))
+    }
+    shaped = with_shape(load_anny(), np.array(config.body_shape, np.float32))
+    simulated = (config.frames - 1) * config.capture_every + 1
+    motion = make_motion(shaped, config.motion, config.simulation.fps, simulated, streams["motion"])
+    kept = slice(None, None, config.capture_every)
+    poses = PoseSequence(
+        motion.rotations[kept],
+        motion.translations[kept],
+        motion.shape,
+        np.arange(1, config.frames + 1, dtype=np.int32),
+        config.simulation.fps / config.capture_every,
+        motion.joint_names,
+    )
+    clip = [pose_frame(shaped, motion, index) for index in range(simulated)]
+    pattern = tshirt_pattern(shaped, config.style)
+    coarse = mesh_pattern(pattern, config.simulation.vertices, streams["coarse"])
+    fine = mesh_pattern(pattern, config.relaxation.vertices, streams["fine"])
+    return Take(
+        config=config,
+        shaped=shaped,
+        poses=poses,
+        bodies=approach_poses(shaped, motion, config.simulation) + clip,
+        pattern=pattern,
+        coarse=coarse,
+        fine=fine,
+        template=mesh_pattern(pattern, config.template_vertices, streams["template"]),
+        wrinkles=wrinkle_mesh(coarse, fine, config.relaxation, streams["imperfection"]),
+    )
+
+
+def run(output: Path, config: SynthConfig, *, workers: int = 2, overwrite: bool = False) -> str:
+    """Simulate and scan a take; the digest of the capture folder.
+
+    Simulation is sequential and starts over when it was interrupted; scans are made in parallel and kept.
+    """
+    stage = open_stage(
+        output, name="synth", schema=SCHEMA, config=config, upstream={}, overwrite=overwrite
+    )
+    frame_ids = list(range(1, config.frames + 1))
+    if stage.pending(frame_ids, folder="truth"):
+        if stage.pending(frame_ids, folder="truth") and not (stage.path / "cloth" / "complete.json").exists():
+            job = _SimulationJob(stage, config)
+            list(
+                run_jobs(
+                    _simulate,
+                    [job],
+                    workers=1,
+                    label="Simulating cloth",
+                    units=lambda _: config.frames,
+                    finished=lambda: len(list((stage.path / "cloth").glob("0*.npz"))),
+                )
+            )
+        jobs = [_ScanJob(stage, config, frame_id) for frame_id in stage.pending(frame_ids, folder="truth")]
+        list(run_jobs(_scan, jobs, workers=workers, label="Scanning"))
+    _write_quality(stage, frame_ids)
+    files = [path for path in sorted(stage.path.rglob("*")) if path.is_file() and _belongs(stage, path)]
+    digest = stage.finish(files)
+    for path in sorted((stage.path / "cloth").glob("*")):
+        path.unlink()
+    return digest
+
+
+def _belongs(stage: Stage, path: Path) -> bool:
+    relative = path.relative_to(stage.path)
+    return relative.parts[0] != "cloth" and path.name != "stage.json" and not path.name.startswith(".")
+
+
+@dataclass(frozen=True, slots=True)
+class _SimulationJob:
+    stage: Stage
+    config: SynthConfig
+
+
+@dataclass(frozen=True, slots=True)
+class _ScanJob:
+    stage: Stage
+    config: SynthConfig
+    frame_id: int
+
+
+def simulate_take(take: Take):
+    """Simulate a take, coarse and fine.
+
+    Yields:
+        For each simulated frame: its index (negative before the clip), the coarse cloth (C, 3), and for captured
+        frames the fine cloth (V, 3), else None.
+    """
+    fabric, lead, offsets = FABRICS[take.config.fabric], take.lead, None
+    faces = take.shaped.body.template.faces
+    start = dress(take.shaped, take.coarse, take.pattern, take.bodies[0])
+
+    def relax(coarse: np.ndarray, body: PosedBody) -> np.ndarray:
+        nonlocal offsets
+        fine, offsets = relax_frame(
+            take.wrinkles, coarse, body.vertices(), faces, offsets, fabric, take.config.relaxation
+        )
+        return fine
+
+    with ThreadPoolExecutor(1) as second_core:  # newton and numba both release the interpreter
+        waiting = []
+        for step, coarse in enumerate(simulate(take.coarse, start, take.bodies, fabric, take.config.simulation)):
+            index = step - lead
+            captured = index >= 0 and index % take.config.capture_every == 0
+            future = second_core.submit(relax, coarse, take.bodies[step]) if captured else None
+            waiting.append((index, coarse, future))
+            while waiting and (waiting[0][2] is None or waiting[0][2].done() or len(waiting) > 8):
+                index, coarse, future = waiting.pop(0)
+                yield index, coarse, None if future is None else future.result()
+        for index, coarse, future in waiting:
+            yield index, coarse, None if future is None else future.result()
+
+
+def _simulate(job: _SimulationJob) -> None:
+    take, folder, config = prepare_take(job.config), job.stage.path, job.config
+    faces = take.shaped.body.template.faces
+    dressed, extent = None, []
+    for index, coarse, fine in simulate_take(take):
+        step = index + take.lead
+        if step == config.simulation.calm_frames - 1:
+            dressed = carry(take.coarse, take.template, coarse)
+        if index == 0:
+            _write_model(take, folder, dressed, coarse, fine)
+        if fine is None:
+            continue
+        frame_id = 1 + index // config.capture_every
+        surface = take.bodies[step].vertices()
+        quality = measure_cloth(take.fine, take.wrinkles, fine, surface, faces)
+        write_json(folder / "cloth" / f"{frame_id:06d}.json", asdict(quality))
+        write_npz(folder / "cloth" / f"{frame_id:06d}.npz", vertices=fine, body=surface.astype(np.float32))
+        extent.append((fine.min(axis=0), fine.max(axis=0)))
+    centre, radius = bounding_sphere(np.array(extent))
+    rig_config = config.scanner.rig
+    rig = capture_rig(
+        centre=centre,
+        radius=max(radius, RIG_RADIUS_M),
+        cameras=rig_config.cameras,
+        image_size=rig_config.image_size,
+        field_of_view_deg=rig_config.field_of_view_deg,
+    )
+    save_rig(folder / "rig.json", rig)
+    save_body(folder / "body.npz", take.shaped.body)
+    save_poses(folder / "poses.npz", _measured_poses(take))
+    save_poses(folder / "truth" / "poses.npz", take.poses)
+    write_capture_description(
+        Capture(
+            folder,
+            config.name,
+            take.poses.fps,
+            tuple(int(frame_id) for frame_id in take.poses.frame_ids),
+            GARMENT_COLOUR,
+            dict.fromkeys(take.pattern.borders, BORDER_COLOUR),
+        )
+    )
+    write_json(folder / "cloth" / "complete.json", {"frames": config.frames})
+
+
+def _write_model(take: Take, folder: Path, dressed: np.ndarray, coarse: np.ndarray, fine: np.ndarray) -> None:
+    """The template, and the truth that no frame changes."""
+    body_at = take.config.simulation.calm_frames - 1
+    settled = carry(take.coarse, take.template, coarse)
+    garment = bind_template(take.template, dressed, take.bodies[body_at], settled, take.bodies[take.lead])
+    save_garment(folder / "template.npz", garment)
+    faces, weights = locate(take.fine, take.template.vertex_uv)
+    write_truth_model(
+        folder / "truth" / "model.npz",
+        TruthModel(
+            fine=Mesh(fine, take.fine.faces, take.fine.uv.astype(np.float32)),
+            loops={name: loop.astype(np.int32) for name, loop in take.fine.loops.items()},
+            template_faces=faces,
+            template_barycentric=weights.astype(np.float32),
+        ),
+    )
+
+
+def _measured_poses(take: Take) -> PoseSequence:
+    """The poses as motion capture would give them: each joint off by a slowly varying rotation."""
+    rng = np.random.default_rng([take.config.seed, 100])
+    poses = take.poses
+    noise = gaussian_filter1d(rng.standard_normal((*poses.rotations.shape[:2], 3)), 6, axis=0, mode="nearest")
+    noise *= np.radians(take.config.mocap_noise_deg) / max(noise.std(), 1e-12) / np.sqrt(3)
+    turned = Rotation.from_rotvec(noise.reshape(-1, 3)).as_matrix().reshape(poses.rotations.shape)
+    return PoseSequence(
+        (turned @ poses.rotations).astype(np.float32),
+        poses.translations,
+        poses.shape,
+        poses.frame_ids,
+        poses.fps,
+        poses.joint_names,
+    )
+
+
+def paint_garment(mesh: PanelMesh) -> np.ndarray:
+    """sRGB per vertex, (V, 3) uint8: the garment's colour, and a painted band along every border of the pattern."""
+    border = np.concatenate(list(mesh.loops.values()))
+    corners = np.isin(mesh.faces, border)
+    painted = cKDTree(mesh.uv[corners]).query(mesh.vertex_uv, distance_upper_bound=BORDER_BAND_M)[0] < BORDER_BAND_M
+    return np.where(painted[:, None], BORDER_COLOUR, GARMENT_COLOUR).astype(np.uint8)
+
+
+def dress_colours(shaped: ShapedBody) -> np.ndarray:
+    """sRGB per body vertex, (B, 3) uint8: a plain suit; head, hands and feet are bare."""
+    regions = shaped.body.regions
+    bare = np.zeros(len(shaped.vertices), bool) if regions is None else regions > 0
+    return np.where(bare[:, None], SKIN_COLOUR, SUIT_COLOUR).astype(np.uint8)
+
+
+_PREPARED: dict[SynthConfig, tuple[Take, Rig]] = {}
+"""What a scanning process prepares once; a process serves one take."""
+
+
+def _scan(job: _ScanJob) -> int:
+    if job.config not in _PREPARED:
+        _PREPARED.clear()
+        _PREPARED[job.config] = prepare_take(job.config), load_rig(job.stage.path / "rig.json")
+    take, rig = _PREPARED[job.config]
+    folder, frame_id, config = job.stage.path, job.frame_id, job.config
+    with np.load(folder / "cloth" / f"{frame_id:06d}.npz", allow_pickle=False) as cloth:
+        fine, surface = cloth["vertices"], cloth["body"]
+    fusion = config.scanner.fusion
+    garment = Surface(Mesh(fine, take.fine.faces), paint_garment(take.fine), LABEL_GARMENT, fusion.garment_voxel_m)
+    body = Surface(
+        Mesh(surface, take.shaped.body.template.faces), dress_colours(take.shaped), LABEL_BODY, fusion.body_voxel_m
+    )
+    scan, labels = scan_surfaces(
+        rig,
+        [garment, body],
+        config=config.scanner,
+        rng=np.random.default_rng([config.seed, 200, frame_id]),
+        frame_id=frame_id,
+        time_s=(frame_id - 1) / take.poses.fps,
+    )
+    write_scan(folder / "scans" / f"{frame_id:06d}.ply", scan)
+    position = frame_id - 1
+    write_truth_frame(
+        folder / "truth" / f"{frame_id:06d}.npz",
+        TruthFrame(fine, take.poses.rotations[position], take.poses.translations[position], labels),
+    )
+    return frame_id
+
+
+def _write_quality(stage: Stage, frame_ids: list[int]) -> None:
+    """Gather the measures of every simulated frame; bad frames are reported, not hidden."""
+    path = stage.path / "truth" / "quality.json"
+    if path.exists():
+        return
+    rows = [
+        {"frame_id": frame_id, **json.loads((stage.path / "cloth" / f"{frame_id:06d}.json").read_text())}
+        for frame_id in frame_ids
+    ]
+    write_json(path, rows)
+    bad = [row for row in rows if row["reasons"]]
+    for row in bad[:10]:
+        print(f"frame {row['frame_id']}: {'; '.join(row['reasons'])}")
+    if len(bad) > 10:
+        print(f"... and {len(bad) - 10} more flagged frames, all in {path}")
