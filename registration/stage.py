@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+from capture4d.errors import InputError
 from capture4d.garment_stage import load_garment_scan
 from capture4d.scans import load_garment, read_body, read_capture, read_poses, read_template, save_garment
 from capture4d.types import RegisteredSequence
@@ -75,6 +76,8 @@ def run(
         output, name="register", schema=SCHEMA, config=config, upstream={"garment": digest}, overwrite=overwrite
     )
     garment = read_template(description)
+    if description.boundary_colours and not garment.loops:
+        raise InputError(f"{capture}: expected a template with open borders, for the scans have painted ones; found none")
     if not (output / "garment.npz").is_file():
         save_garment(output / "garment.npz", garment)
     poses = read_poses(description)

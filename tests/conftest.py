@@ -1,14 +1,36 @@
 """Array shapes and types are checked on every call while tests run, and only then; and a capture to test with."""
 
+import ast
 from pathlib import Path
 
+import jaxtyping
+import jaxtyping._import_hook
 import numpy as np
 import pytest
-from jaxtyping import install_import_hook
 
-install_import_hook(
-    ["capture4d", "data_synth", "registration", "retarget", "wrinkles", "benchmarks"], "beartype.beartype"
-)
+_ROOT = Path(__file__).parents[1]
+# tyro puts its own placeholders into the fields of a command that are still to be given.
+_UNCHECKED = {"capture4d.app.cli"}
+
+
+def _install_shape_checks() -> None:
+    """Check every function of ours but compiled kernels, whose source is not Python's to wrap."""
+    packages = ("capture4d", "data_synth", "registration", "retarget", "wrinkles", "benchmarks")
+    files = [path for package in packages for path in (_ROOT / package).rglob("*.py") if path.name != "__init__.py"]
+    modules = {".".join(path.relative_to(_ROOT).with_suffix("").parts) for path in files} - _UNCHECKED
+
+    marked_unchecked = jaxtyping._import_hook._is_no_type_check
+
+    def is_unchecked(decorator: ast.expr) -> bool:
+        return marked_unchecked(decorator) or ast.unparse(decorator).startswith(("njit", "wp."))
+
+    jaxtyping._import_hook._is_no_type_check = is_unchecked
+    # As for any other type checker, an int will do for a float.
+    checker = "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"
+    jaxtyping.install_import_hook(sorted(modules), checker)
+
+
+_install_shape_checks()
 
 
 @pytest.fixture

@@ -20,6 +20,8 @@ import tyro
 from tyro.conf import Positional, UseAppendAction, arg
 
 from capture4d.errors import InputError
+from data_synth import config as synth_config
+from data_synth.scanner_config import ScanConfig
 from registration import config as registration_config
 from registration.config import RegistrationConfig
 
@@ -59,6 +61,51 @@ class Demo(_Stage):
         from capture4d.app.pipeline import run_demo
 
         print(f"report: {run_demo(self.output, workers=self.workers, overwrite=self.overwrite)}")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Synth(_Stage):
+    """Simulate a garment on a moving body and scan it: a capture folder with its exact truth."""
+
+    output: Positional[Path]
+    """Capture folder to write."""
+    preset: Literal[*synth_config.PRESETS] = "demo"
+    """What the settings below start from."""
+    config: Annotated[synth_config.SynthConfig, arg(name="")] = field(default_factory=synth_config.SynthConfig)
+
+    def __call__(self) -> int:
+        from data_synth.stage import run
+
+        run(self.output, self.config, workers=self.workers, overwrite=self.overwrite)
+        print(f"capture: {self.output}")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scan(_Stage):
+    """Scan your own mesh sequence with the virtual camera rig: a capture folder, with truth if the faces stay."""
+
+    meshes: Positional[Path]
+    """Folder of mesh files, one per frame in order of name; or .npz with vertices (T, V, 3) and faces (F, 3)."""
+    output: Positional[Path]
+    """Capture folder to write."""
+    template: Path | None = None
+    """Mesh to register later: lies on the first mesh, or is the same mesh in another pose."""
+    config: Annotated[ScanConfig, arg(name="")] = field(default_factory=ScanConfig)
+
+    def __call__(self) -> int:
+        from data_synth.scan_stage import run
+
+        run(
+            self.meshes,
+            self.output,
+            self.config,
+            template=self.template,
+            workers=self.workers,
+            overwrite=self.overwrite,
+        )
+        print(f"capture: {self.output}")
         return 0
 
 
@@ -166,6 +213,8 @@ class ConvertBody:
 
 _COMMANDS: Mapping[str, Any] = {
     "demo": Demo,
+    "synth": Synth,
+    "scan": Scan,
     "extract": Extract,
     "register": Register,
     "run": Run,
@@ -174,6 +223,7 @@ _COMMANDS: Mapping[str, Any] = {
 }
 
 _PRESETS: Mapping[Any, Mapping[str, Any]] = {
+    Synth: synth_config.PRESETS,
     Register: registration_config.PRESETS,
     Run: registration_config.PRESETS,
 }
@@ -232,7 +282,7 @@ def _parse(name: str, arguments: list[str]) -> Any:
     presets = _PRESETS.get(command)
     default = None
     if presets:
-        given = _value_of("--preset", arguments)
+        given = _value_of("--preset", arguments) or next(iter(presets))
         if given in presets:
             required = {
                 entry.name: tyro.MISSING

@@ -99,7 +99,9 @@ def test_ply_big_endian_with_windows_line_ends(tmp_path: Path):
         "ply\r\nformat binary_big_endian 1.0\r\nelement vertex 3\r\nproperty float x\r\nproperty float y\r\n"
         "property float z\r\nelement face 1\r\nproperty list uchar int vertex_indices\r\nend_header\r\n"
     )
-    path.write_bytes(header.encode() + struct.pack(">9f", 0, 0, 0, 1, 0, 0, 0, 1, 0.5) + struct.pack(">B3i", 3, 0, 1, 2))
+    path.write_bytes(
+        header.encode() + struct.pack(">9f", 0, 0, 0, 1, 0, 0, 0, 1, 0.5) + struct.pack(">B3i", 3, 0, 1, 2)
+    )
     found = read_mesh(path)
     assert found.mesh.vertices.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0.5]]
     assert found.mesh.faces.tolist() == [[0, 1, 2]]

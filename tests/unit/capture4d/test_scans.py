@@ -182,7 +182,9 @@ def test_bodies_garments_and_rigs_come_back(tmp_path: Path):
         {"hem": np.array([0, 1], np.int32), "cuff_left": np.array([2], np.int32)},
         skin_weights=weights,
     )
-    rig = Rig(("a", "b"), rng.random((2, 3, 3)), np.zeros((2, 5)), rng.random((2, 4, 4)), np.full((2, 2), 512, np.int32))
+    rig = Rig(
+        ("a", "b"), rng.random((2, 3, 3)), np.zeros((2, 5)), rng.random((2, 4, 4)), np.full((2, 2), 512, np.int32)
+    )
     save_body(tmp_path / "body.npz", body)
     save_garment(tmp_path / "garment.npz", garment)
     save_rig(tmp_path / "rig.json", rig)

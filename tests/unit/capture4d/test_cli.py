@@ -1,0 +1,294 @@
+"""The command line: what is wrong is one line and exit 1, and nothing that was done is lost."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from capture4d.app.cli import main
+from capture4d.errors import InputError
+from capture4d.mesh_files import read_mesh, write_mesh
+from capture4d.records import load_garment, save_garment, save_poses
+from capture4d.types import Mesh, PoseSequence
+from capture4d.workdir import write_bytes, write_json
+
+
+def run(*arguments: str | Path) -> int:
+    with pytest.raises(SystemExit) as exit_:
+        main([str(argument) for argument in arguments])
+    return int(exit_.value.code or 0)
+
+
+def fails(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
+    """Run a command that must fail on its input; the one line it says."""
+    capsys.readouterr()
+    assert run(*arguments) == 1
+    said = capsys.readouterr().err.strip()
+    line = said.splitlines()[-1]
+    assert line.startswith("capture4d: ")
+    assert "Traceback" not in said
+    return line
+
+
+def extract(capture: Path, work: Path) -> tuple[str | Path, ...]:
+    return "extract", capture, "--output", work, "--workers", "1"
+
+
+@pytest.fixture
+def work(tmp_path: Path) -> Path:
+    return tmp_path / "work"
+
+
+# --- the command itself
+
+
+def test_help_names_every_command_and_loads_nothing_heavy():
+    script = (
+        "import sys; from capture4d.app.cli import main\n"
+        "try: main(['--help'])\n"
+        "except SystemExit as end: code = end.code\n"
+        "heavy = {'numpy', 'scipy', 'torch', 'open3d', 'numba', 'warp', 'newton', 'trimesh'} & set(sys.modules)\n"
+        "sys.exit(code or bool(heavy) and f'loaded {heavy}')"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    for name in ("demo", "synth", "extract", "register", "run", "report"):
+        assert f"\n  {name} " in done.stdout
+
+
+@pytest.mark.parametrize(
+    "arguments", [["regster"], ["run"], ["run", "x"], ["run", "x", "--output", "y", "--wrokers", "3"]]
+)
+def test_a_wrong_command_line_is_exit_2(arguments: list[str], capsys: pytest.CaptureFixture[str]):
+    assert run(*arguments) == 2
+    said = capsys.readouterr()
+    assert "Traceback" not in said.err + said.out
+
+
+def test_a_near_miss_gets_a_hint(capsys: pytest.CaptureFixture[str]):
+    run("regster")
+    assert "did you mean 'register'?" in capsys.readouterr().err
+
+
+def test_a_preset_is_what_single_options_start_from(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    import registration.stage
+    from registration.config import PAPER, GraphConfig
+
+    seen = []
+    monkeypatch.setattr(registration.stage, "run", lambda *args, **options: seen.append(args[3]))
+    for options in ([], ["--preset", "paper"], ["--preset=paper", "--graph.nodes", "99"]):
+        run("register", "capture", "--output", tmp_path, *options)
+    assert seen[0].mode == "default"
+    assert seen[1] == PAPER
+    assert seen[2] == replace(PAPER, graph=GraphConfig(nodes=99, vertices=0))
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        (InputError("scan.ply: expected cloth,\nfound none"), 1, "capture4d: scan.ply: expected cloth, found none\n"),
+        (PermissionError(13, "Permission denied", "out/x.npz"), 1, "capture4d: out/x.npz: Permission denied\n"),
+        (
+            OSError(28, "No space left on device", "out/x.npz"),
+            1,
+            "finished frames are kept, the same command goes on\n",
+        ),
+    ],
+)
+def test_what_is_the_users_to_repair_is_one_line(
+    error: Exception, code: int, said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    import capture4d.garment_stage
+
+    def fail(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr(capture4d.garment_stage, "run", fail)
+    assert run("extract", "capture", "--output", "work") == code
+    written = capsys.readouterr().err
+    assert written.endswith(said)
+    assert written.count("\n") == 1
+
+
+def test_our_own_bugs_keep_their_traceback(monkeypatch: pytest.MonkeyPatch):
+    import capture4d.garment_stage
+
+    def fail(*_: object, **__: object) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(capture4d.garment_stage, "run", fail)
+    with pytest.raises(ZeroDivisionError):
+        main(["extract", "capture", "--output", "work"])
+
+
+# --- bad input
+
+
+def test_missing_capture(work: Path, capsys: pytest.CaptureFixture[str]):
+    assert "nowhere: no such capture folder" in fails(capsys, *extract(Path("nowhere"), work))
+    assert not work.exists()
+
+
+def test_bad_scans_are_named(tube_capture: Path, work: Path, capsys: pytest.CaptureFixture[str]):
+    path = tube_capture / "scans" / "000006.ply"
+    good = path.read_bytes()
+    found = read_mesh(path)
+
+    path.write_bytes(good[: len(good) // 2])
+    assert "000006.ply: cut off" in fails(capsys, *extract(tube_capture, work))
+
+    write_mesh(path, found.mesh)
+    assert "000006.ply: expected a colour per vertex" in fails(capsys, *extract(tube_capture, work / "2"))
+
+    write_mesh(path, Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)), colours=np.zeros((0, 3), np.uint8))
+    assert "000006.ply: empty mesh" in fails(capsys, *extract(tube_capture, work / "3"))
+
+    head, body = good.split(b"end_header\n")
+    path.write_bytes(head + b"end_header\n" + np.float32(np.nan).tobytes() + body[4:])
+    assert "expected finite numbers, found NaN" in fails(capsys, *extract(tube_capture, work / "4"))
+
+    path.unlink()
+    assert "000006.ply: no such scan" in fails(capsys, *extract(tube_capture, work / "5"))
+
+
+def test_a_repaired_scan_lets_the_same_command_go_on(
+    tube_capture: Path, work: Path, capsys: pytest.CaptureFixture[str]
+):
+    path = tube_capture / "scans" / "000007.ply"
+    good = path.read_bytes()
+    path.write_bytes(good[:-9] + b"\xff" * 9)  # same size: face 7 points nowhere
+    fails(capsys, *extract(tube_capture, work))
+    done = work / "garment" / "frames" / "000005.npz"
+    before = done.stat().st_mtime_ns
+    path.write_bytes(good)
+    assert run(*extract(tube_capture, work)) == 0
+    assert done.stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize("entry", ["garment_colour", "boundary_colours"])
+def test_a_colour_that_is_not_in_the_scan(
+    entry: str, tube_capture: Path, work: Path, capsys: pytest.CaptureFixture[str]
+):
+    description = json.loads((tube_capture / "capture.json").read_text())
+    description[entry] = "#00ff00" if entry == "garment_colour" else {"neck": "#00ff00", "hem": "#00ff00"}
+    write_json(tube_capture / "capture.json", description)
+    said = fails(capsys, *extract(tube_capture, work))
+    assert "000005.ply" in said
+    assert "#00ff00" in said
+
+
+def test_a_template_without_the_borders_that_are_painted(
+    tube_capture: Path, work: Path, capsys: pytest.CaptureFixture[str]
+):
+    template = load_garment(tube_capture / "template.npz")
+    save_garment(tube_capture / "template.npz", replace(template, loops={}))
+    assert run(*extract(tube_capture, work)) == 0
+    said = fails(capsys, "register", tube_capture, "--output", work, "--workers", "1")
+    assert "border" in said
+
+
+def test_poses_that_do_not_match_the_scans(tube_capture: Path, work: Path, capsys: pytest.CaptureFixture[str]):
+    poses = PoseSequence(
+        rotations=np.tile(np.eye(3, dtype=np.float32), (2, 1, 1, 1)),
+        translations=np.zeros((2, 3), np.float32),
+        shape=np.zeros(1, np.float32),
+        frame_ids=np.array([5, 6], np.int32),
+        fps=60.0,
+        joint_names=("root",),
+    )
+    save_poses(tube_capture / "poses.npz", poses)
+    assert run(*extract(tube_capture, work)) == 0
+    said = fails(capsys, "register", tube_capture, "--output", work, "--workers", "1")
+    assert "poses.npz: expected a pose for each of 3 scans, found none for 1 of them, frame 7 first" in said
+
+
+def test_registering_what_was_not_extracted(tube_capture: Path, work: Path, capsys: pytest.CaptureFixture[str]):
+    said = fails(capsys, "register", tube_capture, "--output", work)
+    assert f"run: capture4d extract {tube_capture} --output {work}" in said
+
+
+def test_other_settings_are_refused_and_overwrite_starts_clean(
+    tube_capture: Path, work: Path, capsys: pytest.CaptureFixture[str]
+):
+    register = ("register", tube_capture, "--output", work, "--workers", "1")
+    assert run(*extract(tube_capture, work)) == 0
+    assert run(*register) == 0
+    stacked = (work / "registration" / "vertices.npy").read_bytes()
+
+    said = fails(capsys, *register, "--graph.nodes", "77")
+    assert "config.graph.nodes: was 300, now 77" in said
+    assert "--overwrite" in said
+    assert (work / "registration" / "vertices.npy").read_bytes() == stacked
+    assert run(*register, "--graph.nodes", "77", "--overwrite") == 0
+    assert (work / "registration" / "vertices.npy").read_bytes() != stacked
+
+
+def test_an_output_folder_of_something_else(tube_capture: Path, work: Path, capsys: pytest.CaptureFixture[str]):
+    write_bytes(work / "garment" / "notes.txt", b"mine")
+    assert "expected an empty folder" in fails(capsys, *extract(tube_capture, work), "--overwrite")
+    assert (work / "garment" / "notes.txt").read_bytes() == b"mine"
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of 400 kB."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mounted = os.geteuid() == 0 and shutil.which("mount")
+    if not mounted or subprocess.run(["mount", "-t", "tmpfs", "-o", "size=400k", "none", folder]).returncode:
+        pytest.skip("needs the right to mount a tmpfs")
+    yield folder
+    subprocess.run(["umount", folder], check=True)
+
+
+def test_a_full_disk_loses_nothing(
+    tube_capture: Path, small_disk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    said = fails(capsys, *extract(tube_capture, small_disk))
+    assert "No space left on device; finished frames are kept, the same command goes on" in said
+    assert str(small_disk) in said
+    finished = sorted((small_disk / "garment" / "frames").glob("*.npz"))
+    assert finished
+    assert not list(small_disk.rglob("*.partial"))
+    assert run(*extract(tube_capture, tmp_path / "large")) == 0
+    for path in finished:
+        assert path.read_bytes() == (tmp_path / "large" / "garment" / "frames" / path.name).read_bytes()
+
+    subprocess.run(["mount", "-o", "remount,size=4m", small_disk], check=True)
+    assert run(*extract(tube_capture, small_disk)) == 0
+
+
+# --- the gate
+
+
+@pytest.mark.parametrize(
+    ("limits", "code"),
+    [
+        (["fit_mean_mm=1.0"], 0),
+        (["fit_mean_mm=0.5"], 1),
+        (["fit_mean_mm=1.0", "boundary_mean_mm=1.0"], 1),
+        (["lost=1e9"], 1),  # null: not measured
+        (["fit=1"], 1),
+        (["fit_mean_mm"], 1),
+    ],
+)
+def test_the_report_gates(
+    limits: list[str], code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    from capture4d.app import pipeline
+
+    values = {"fit_mean_mm": 0.7, "boundary_mean_mm": 2.0, "lost": None}
+    write_json(
+        tmp_path / "report" / "metrics.json",
+        {"metrics": [{"key": key, "value": value, "unit": "mm", "better": "lower"} for key, value in values.items()]},
+    )
+    monkeypatch.setattr(pipeline, "run_report", lambda work: work / "report" / "index.html")
+    options = [word for limit in limits for word in ("--fail-above", limit)]
+    assert run("report", tmp_path, *options) == code
+    assert capsys.readouterr().err.count("\n") == code
