@@ -54,9 +54,16 @@ class CameraImages:
 class SurfaceScene:
     """Surfaces, lit and ready to be seen from many cameras."""
 
-    def __init__(self, surfaces: Sequence[Surface], *, ambient: float = 1.0) -> None:
+    def __init__(self, surfaces: Sequence[Surface], *, ambient: float = 1.0, thickness_m: float = 0.0) -> None:
+        """Light the surfaces.
+
+        Args:
+            ambient: share of the light that comes from everywhere.
+            thickness_m: how much nearer the back of a surface is than its front.
+        """
         geometry = import_open3d().t.geometry
         self._scene = geometry.RaycastingScene(nthreads=1)
+        self._thickness = np.float32(thickness_m)
         self._first_face = np.cumsum([0, *(len(s.mesh.faces) for s in surfaces)])
         for surface in surfaces:
             self._scene.add_triangles(_tensor(surface.mesh.vertices), _tensor(surface.mesh.faces.astype(np.uint32)))
@@ -96,6 +103,7 @@ class SurfaceScene:
             answer["primitive_normals"].numpy(),
             self._first_face,
             self._corner_colours,
+            self._thickness,
         )
         return CameraImages(depth, cosine, surface, colours, origin=(int(top), int(left)))
 
@@ -133,7 +141,20 @@ def _rays(rig: Rig, camera: int, u: np.ndarray, v: np.ndarray) -> Float32[np.nda
 @no_type_check  # keeps the type-checking import hook off the function that numba compiles
 @njit(cache=True)
 def _fill_images(
-    depth, cosine, surface, colours, pixels, rays, t_hit, surface_ids, face_ids, uv, normals, first_face, corner_colours
+    depth,
+    cosine,
+    surface,
+    colours,
+    pixels,
+    rays,
+    t_hit,
+    surface_ids,
+    face_ids,
+    uv,
+    normals,
+    first_face,
+    corner_colours,
+    thickness,
 ):
     """Scatter the hits of rays to the pixels (rows, columns) they went through."""
     for ray in range(len(rays)):
@@ -143,7 +164,7 @@ def _fill_images(
         direction, normal = rays[ray, 3:], normals[ray]
         length = np.sqrt(direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2)
         toward = direction[0] * normal[0] + direction[1] * normal[1] + direction[2] * normal[2]
-        depth[row, column] = t_hit[ray]
+        depth[row, column] = t_hit[ray] - (thickness / max(toward, 0.1 * length) if toward > 0 else 0)
         cosine[row, column] = -toward / length
         surface[row, column] = surface_ids[ray]
         corners = corner_colours[first_face[surface_ids[ray]] + face_ids[ray]]

@@ -37,8 +37,9 @@ def scan_surfaces(
 ) -> tuple[Scan, UInt8[np.ndarray, " verts"]]:
     """Scan surfaces from every camera of a rig.
 
-    A surface may be an open sheet: its two sides are then fused apart, so that the inside of a sleeve is scanned
-    without disturbing its outside.
+    A garment is an open sheet. Its back hides what is behind it; whether it is scanned too is a setting, and then the
+    two sides are fused apart, so that the inside of a sleeve does not disturb its outside. (A garment given as two
+    sheets closer together than the truncation does: give one of them.)
 
     Args:
         rng: the only source of randomness; the same state gives the same arrays, on any number of threads.
@@ -50,13 +51,12 @@ def scan_surfaces(
         raise InputError("rig.distortion: the scanner needs undistorted cameras, found non-zero coefficients")
     if not surfaces:
         raise InputError("surfaces: expected at least one, found none")
-    scene = SurfaceScene(surfaces, ambient=config.shading.ambient)
+    scene = SurfaceScene(surfaces, ambient=config.shading.ambient, thickness_m=config.fusion.thickness_m)
     fields = draw_noise_fields(config.noise, rng, largest_image=int(rig.image_sizes.max()))
     areas = [float(face_areas(s.mesh.vertices, s.mesh.faces).sum()) for s in surfaces]
-    volumes = [
-        (DepthFusion(s.voxel_m, area, config=config.fusion), DepthFusion(s.voxel_m, 0.1 * area, config=config.fusion))
-        for s, area in zip(surfaces, areas, strict=True)
-    ]
+    volumes = [DepthFusion(s.voxel_m, area, config=config.fusion) for s, area in zip(surfaces, areas, strict=True)]
+    insides = [DepthFusion(s.voxel_m, 0.1 * area, config=config.fusion) for s, area in zip(surfaces, areas, strict=True)]
+    sides = [(volumes, 1), (insides, -1)] if config.fusion.inside else [(volumes, 1)]
     for camera in range(len(rig.names)):
         images = scene.view(rig, camera)
         if images is None:
@@ -66,25 +66,25 @@ def scan_surfaces(
         colours += np.float32(config.shading.pixel_noise) * fields.window(fields.colour, depth.shape, rng)
         K = rig.intrinsics[camera].copy()
         K[:2, 2] -= images.origin[::-1]
-        for index, sides in enumerate(volumes):
-            for volume, visible in zip(sides, (images.cosine > 0, images.cosine < 0), strict=True):
-                here = visible & (images.surface == index)
+        for side, sign in sides:
+            for index, volume in enumerate(side):
+                here = (images.surface == index) & (sign * images.cosine > 0)
                 volume.add(np.where(here, depth, np.float32(0)), colours, K, rig.T_camera_world[camera])
-    return _merge(surfaces, volumes, frame_id, time_s)
+    parts = [part for side, _ in sides for part in zip(surfaces, side, strict=True)]
+    return _merge(parts, frame_id, time_s)
 
 
 def _merge(
-    surfaces: Sequence[Surface], volumes: Sequence[Sequence[DepthFusion]], frame_id: int, time_s: float
+    parts: Sequence[tuple[Surface, DepthFusion]], frame_id: int, time_s: float
 ) -> tuple[Scan, UInt8[np.ndarray, " verts"]]:
     vertices, faces, colours, labels, count = [], [], [], [], 0
-    for surface, sides in zip(surfaces, volumes, strict=True):
-        for volume in sides:
-            mesh, colour = volume.extract()
-            vertices.append(mesh.vertices)
-            faces.append(mesh.faces + np.int32(count))
-            colours.append(colour)
-            labels.append(_labels(surface, mesh.vertices))
-            count += len(mesh.vertices)
+    for surface, volume in parts:
+        mesh, colour = volume.extract()
+        vertices.append(mesh.vertices)
+        faces.append(mesh.faces + np.int32(count))
+        colours.append(colour)
+        labels.append(_labels(surface, mesh.vertices))
+        count += len(mesh.vertices)
     mesh = Mesh(np.concatenate(vertices), np.concatenate(faces))
     return Scan(mesh, np.concatenate(colours), frame_id, time_s), np.concatenate(labels)
 

@@ -7,8 +7,9 @@ prints them). Lengths are metres unless the name says otherwise.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
-__all__ = ["FusionConfig", "NoiseConfig", "RigConfig", "ScannerConfig", "ShadingConfig"]
+__all__ = ["FusionConfig", "NoiseConfig", "RigConfig", "ScanConfig", "ScannerConfig", "ShadingConfig"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +74,11 @@ class FusionConfig:
     """Cameras that must have seen a voxel."""
     block_resolution: int = 8
     """Voxels along the edge of a block of the sparse grid."""
+    inside: bool = False
+    """Scan the inside of open sheets too, where it is seen, as a sheet of its own. Off, it is too dark to be scanned:
+    the inside of hems and sleeves is a hole."""
+    thickness_m: float = 0.001
+    """Of open sheets: how far behind its outside their inside is scanned."""
     min_component_faces: int = 400
     """Smaller connected pieces are dropped."""
 
@@ -85,3 +91,33 @@ class ScannerConfig:
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     shading: ShadingConfig = field(default_factory=ShadingConfig)
     fusion: FusionConfig = field(default_factory=FusionConfig)
+
+
+@dataclass(frozen=True, slots=True)
+class ScanConfig:
+    """How a sequence of meshes becomes a capture."""
+
+    height_m: float | None = None
+    """Scale the sequence so that its first frame is this tall; None keeps the sizes as metres."""
+    up: Literal["x", "y", "z"] = "y"
+    """The axis of the meshes that points up."""
+    fps: float = 60.0
+    """Frames per second of the sequence."""
+    first_frame: int = 0
+    """Index of the first mesh to scan."""
+    frames: int | None = None
+    """How many meshes to scan; None scans all."""
+    step: int = 1
+    """Scan every n-th mesh."""
+    garment_colour: str = "#2f62c9"
+    """Colour of the surface."""
+    border_paint_m: float = 0.012
+    """Width of the painted band along open borders; 0 paints none."""
+    border_colours: tuple[str, ...] = ("#ffd200", "#e5332a", "#31b04a", "#f07be0", "#35c6d6", "#f28c1e")
+    """Paint of the border loops, the longest loop first; fewer colours than loops are used in turn."""
+    template_vertices: int | None = None
+    """Size of the template, made from the first frame by decimation; None takes the first mesh itself. Ignored where a
+    template is given."""
+    seed: int = 0
+    """Of the sensor noise."""
+    scanner: ScannerConfig = field(default_factory=ScannerConfig)

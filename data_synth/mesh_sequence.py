@@ -1,0 +1,71 @@
+"""Mesh sequences from other tools: a folder of mesh files, or one npz with `vertices` (T, V, 3) and `faces` (F, 3)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from capture4d.errors import InputError
+from capture4d.mesh_files import MESH_SUFFIXES, read_mesh
+from capture4d.records import ArrayFile
+from capture4d.types import Mesh
+from capture4d.workdir import file_digest
+
+__all__ = ["MeshSequence", "open_sequence"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeshSequence:
+    """Meshes that are read one by one, in the units and axes of their files."""
+
+    path: Path
+    files: Mapping[int, Path]
+    """Mesh file of each frame number; all the same npz if the sequence is one."""
+
+    @property
+    def frame_ids(self) -> tuple[int, ...]:
+        return tuple(self.files)
+
+    def read(self, frame_id: int) -> Mesh:
+        """One frame's mesh."""
+        path = self.files[frame_id]
+        if path.suffix != ".npz":
+            return read_mesh(path).mesh
+        with ArrayFile(path) as arrays:
+            return Mesh(arrays["vertices"][frame_id].astype(np.float32), arrays["faces"].astype(np.int32))
+
+    def digest(self) -> str:
+        return file_digest(set(self.files.values()), root=self.path if self.path.is_dir() else self.path.parent)
+
+
+def open_sequence(path: Path) -> MeshSequence:
+    """Find the frames of a sequence. A file's frame number is the last number in its name.
+
+    Raises:
+        InputError: there is nothing, or the names do not tell the frames apart.
+    """
+    if path.is_file() and path.suffix == ".npz":
+        with ArrayFile(path) as arrays:
+            shape = arrays["vertices"].shape
+        if len(shape) != 3 or shape[2] != 3 or not shape[0]:
+            raise InputError(f"{path}: expected vertices of shape (frames, vertices, 3), found {shape}")
+        return MeshSequence(path, dict.fromkeys(range(shape[0]), path))
+    if not path.is_dir():
+        raise InputError(f"{path}: expected a folder of mesh files or an npz, found {'a file' if path.exists() else 'nothing'}")
+    files: dict[int, Path] = {}
+    for file in sorted(path.iterdir()):
+        if file.suffix.lower() not in MESH_SUFFIXES:
+            continue
+        numbers = re.findall(r"\d+", file.stem)
+        if not numbers:
+            raise InputError(f"{file}: expected a frame number in the name, found none")
+        other = files.setdefault(int(numbers[-1]), file)
+        if other != file:
+            raise InputError(f"{file}: has the frame number {int(numbers[-1])} of {other.name}")
+    if not files:
+        raise InputError(f"{path}: expected mesh files ({', '.join(MESH_SUFFIXES)}), found none")
+    return MeshSequence(path, dict(sorted(files.items())))

@@ -1,0 +1,255 @@
+"""The stage that scans a sequence of meshes: any cloth in, an ordinary capture folder with truth out.
+
+Meshes of one topology (all the same faces) give exact truth: the surface of every frame, and the true position of every
+template vertex. Sequences whose faces change are scanned too, without truth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from capture4d.errors import InputError
+from capture4d.evaluation import closest_points
+from capture4d.mesh import boundary_loops
+from capture4d.mesh_files import read_mesh
+from capture4d.open3d_loading import import_open3d
+from capture4d.scans import (
+    Capture,
+    TruthFrame,
+    TruthModel,
+    load_rig,
+    parse_colour,
+    save_garment,
+    save_rig,
+    write_capture_description,
+    write_scan,
+    write_truth_frame,
+    write_truth_model,
+)
+from capture4d.types import Garment, Mesh
+from capture4d.workdir import Stage, file_digest, open_stage, run_jobs
+from data_synth.border_paint import PaintedSheet, paint_borders
+from data_synth.mesh_sequence import MeshSequence, open_sequence
+from data_synth.rig import bounding_sphere, capture_rig
+from data_synth.scanner import LABEL_GARMENT, Surface, scan_surfaces
+from data_synth.scanner_config import ScanConfig
+
+__all__ = ["run"]
+
+SCHEMA = 1
+ROTATIONS = {"x": [[0, 1, 0], [1, 0, 0], [0, 0, -1]], "y": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "z": [[1, 0, 0], [0, 0, 1], [0, -1, 0]]}
+
+
+def run(
+    meshes: Path,
+    output: Path,
+    config: ScanConfig,
+    *,
+    template: Path | None = None,
+    workers: int = 1,
+    overwrite: bool = False,
+) -> str:
+    """Scan every mesh that has no scan yet; the digest of the capture.
+
+    Args:
+        meshes: folder of mesh files, or npz with vertices (T, V, 3) and faces (F, 3).
+        output: capture folder.
+        template: mesh to register later. It lies on the first mesh, or is the same mesh in another pose.
+    Raises:
+        InputError: there are no meshes, or one is damaged, or the template has nothing to do with them.
+    """
+    _sequence.cache_clear()
+    source = _open_source(meshes, config)
+    upstream = {"meshes": _sequence(meshes).digest()}
+    if template is not None:
+        upstream["template"] = file_digest([template], root=template.parent)
+    stage = open_stage(output, name="scan", schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite)
+    same_topology = _prepare(stage, source, template)
+    jobs = stage.pending(source.frame_ids, ".ply", folder="scans")
+    for _ in run_jobs(partial(_scan_frame, stage, source, same_topology), jobs, workers=workers, label="scan"):
+        pass
+    colours = [parse_colour(text) for text in config.border_colours]
+    garment = source.loop_names if colours and config.border_paint_m > 0 else ()
+    write_capture_description(
+        Capture(
+            path=output,
+            name=meshes.stem,
+            fps=config.fps / config.step,
+            frame_ids=source.frame_ids,
+            garment_colour=parse_colour(config.garment_colour),
+            boundary_colours={name: colours[index % len(colours)] for index, name in enumerate(garment)},
+        )
+    )
+    names = ["capture.json", "rig.json", "template.npz"]
+    frames = [stage.frame_path(frame_id, ".ply", folder="scans") for frame_id in source.frame_ids]
+    truth = sorted((output / "truth").glob("*.npz"))
+    return stage.finish([*(output / name for name in names), *frames, *truth])
+
+
+@dataclass(frozen=True, slots=True)
+class _Source:
+    """A sequence in metres and with Y up. Cheap to send to a worker, which reads the meshes it needs itself."""
+
+    path: Path
+    config: ScanConfig
+    scale: float
+
+    @property
+    def frame_ids(self) -> tuple[int, ...]:
+        return _chosen_frames(_sequence(self.path), self.config)
+
+    @property
+    def loop_names(self) -> tuple[str, ...]:
+        return tuple(f"border_{index}" for index in range(len(boundary_loops(_first(self).faces))))
+
+    def mesh(self, frame_id: int) -> Mesh:
+        return self.upright(_sequence(self.path).read(frame_id))
+
+    def upright(self, mesh: Mesh) -> Mesh:
+        """A mesh of the sequence's files, or the template's, in metres and with Y up."""
+        rotation = np.array(ROTATIONS[self.config.up], float)
+        return mesh.with_vertices((self.scale * mesh.vertices.astype(float) @ rotation.T).astype(np.float32))
+
+
+_sequence = cache(open_sequence)
+
+
+@cache
+def _first(source: _Source) -> Mesh:
+    return source.mesh(source.frame_ids[0])
+
+
+def _open_source(path: Path, config: ScanConfig) -> _Source:
+    scale = 1.0
+    if config.height_m is not None:
+        sequence = _sequence(path)
+        first = sequence.read(_chosen_frames(sequence, config)[0]).vertices
+        scale = config.height_m / float(np.ptp(first[:, "xyz".index(config.up)]))
+    return _Source(path, config, scale)
+
+
+def _chosen_frames(sequence: MeshSequence, config: ScanConfig) -> tuple[int, ...]:
+    chosen = sequence.frame_ids[config.first_frame :: config.step][: config.frames]
+    if not chosen:
+        raise InputError(f"{sequence.path}: no frame left from number {config.first_frame} on")
+    return chosen
+
+
+def _prepare(stage: Stage, source: _Source, template: Path | None) -> bool:
+    """Write rig, template and truth model where missing; whether all meshes have the same faces."""
+    first = _first(source)
+    model, rig = stage.path / "truth" / "model.npz", stage.path / "rig.json"
+    if not rig.is_file():
+        same, lower, upper = True, first.vertices.min(axis=0), first.vertices.max(axis=0)
+        for frame_id in source.frame_ids[1:]:
+            mesh = source.mesh(frame_id)
+            same &= mesh.faces.shape == first.faces.shape and bool((mesh.faces == first.faces).all())
+            lower, upper = np.minimum(lower, mesh.vertices.min(axis=0)), np.maximum(upper, mesh.vertices.max(axis=0))
+        garment, faces, barycentric = _template(source, first, template)
+        save_garment(stage.path / "template.npz", garment)
+        if same:
+            loops = dict(zip(source.loop_names, boundary_loops(first.faces), strict=True))
+            write_truth_model(model, TruthModel(first, loops, faces, barycentric))
+        corners = np.stack([lower, upper])
+        centre, radius = bounding_sphere(corners)
+        options = source.config.scanner.rig
+        save_rig(
+            rig,
+            capture_rig(
+                centre=centre,
+                radius=radius,
+                cameras=options.cameras,
+                image_size=options.image_size,
+                field_of_view_deg=options.field_of_view_deg,
+            ),
+        )
+    return model.is_file()
+
+
+def _template(source: _Source, first: Mesh, path: Path | None) -> tuple[Garment, np.ndarray, np.ndarray]:
+    """The template, and the point of the first mesh (face, barycentric) under each of its vertices."""
+    names = source.loop_names
+    if path is None and source.config.template_vertices is None:
+        return Garment(first, dict(zip(names, boundary_loops(first.faces), strict=True))), *_own_vertices(first)
+    mesh = source.upright(read_mesh(path).mesh) if path else _decimated(first, source.config.template_vertices or 0)
+    same_mesh = mesh.faces.shape == first.faces.shape and bool((mesh.faces == first.faces).all())
+    if same_mesh and len(mesh.vertices) == len(first.vertices):
+        return Garment(mesh, dict(zip(names, boundary_loops(first.faces), strict=True))), *_own_vertices(first)
+    points, faces, barycentric = closest_points(first, mesh.vertices)
+    distance = np.linalg.norm(points - mesh.vertices, axis=1).mean()
+    size = np.ptp(first.vertices, axis=0).max()
+    if distance > 0.01 * size:
+        raise InputError(
+            f"{path}: expected a template that lies on the first mesh of {source.path}, or has its faces, "
+            f"found one that is {distance / size:.0%} of its size away"
+        )
+    return Garment(mesh, _matched_loops(mesh, first, names)), faces, barycentric
+
+
+def _own_vertices(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """Each vertex as a point of one of its faces."""
+    face, corner = np.zeros(len(mesh.vertices), np.int32), np.zeros(len(mesh.vertices), np.int64)
+    face[mesh.faces] = np.arange(len(mesh.faces), dtype=np.int32)[:, None]
+    corner = (mesh.faces[face] == np.arange(len(mesh.vertices))[:, None]).argmax(axis=1)
+    return face, np.eye(3, dtype=np.float32)[corner]
+
+
+def _matched_loops(mesh: Mesh, first: Mesh, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """The template's border loops under the names of the sequence's loops nearest to them."""
+    trees = [cKDTree(first.vertices[loop]) for loop in boundary_loops(first.faces)]
+    loops = {}
+    for loop in boundary_loops(mesh.faces):
+        distances = [tree.query(mesh.vertices[loop])[0].mean() for tree in trees]
+        loops.setdefault(names[int(np.argmin(distances))], loop)
+    return loops
+
+
+def _decimated(mesh: Mesh, vertices: int) -> Mesh:
+    """About `vertices` vertices by quadric error, borders kept."""
+    o3d = import_open3d()
+    legacy = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(mesh.vertices.astype(float)), o3d.utility.Vector3iVector(mesh.faces)
+    )
+    target = int(len(mesh.faces) * vertices / len(mesh.vertices))
+    simple = legacy.simplify_quadric_decimation(target, boundary_weight=10.0)
+    return Mesh(np.asarray(simple.vertices, np.float32), np.asarray(simple.triangles, np.int32))
+
+
+@cache
+def _painted(source: _Source) -> PaintedSheet:
+    return _paint(_first(source), source.config)
+
+
+def _paint(mesh: Mesh, config: ScanConfig) -> PaintedSheet:
+    return paint_borders(
+        mesh,
+        width_m=config.border_paint_m,
+        garment_colour=parse_colour(config.garment_colour),
+        border_colours=[parse_colour(text) for text in config.border_colours],
+        max_edge_m=config.scanner.fusion.garment_voxel_m,
+    )
+
+
+def _scan_frame(stage: Stage, source: _Source, same_topology: bool, frame_id: int) -> None:
+    """Scan one mesh; truth first, for the frame counts as done once its scan is there."""
+    config = source.config
+    mesh = source.mesh(frame_id)
+    sheet = _painted(source) if same_topology else _paint(mesh, config)
+    surface = Surface(sheet.posed(mesh.vertices), sheet.colours, LABEL_GARMENT, config.scanner.fusion.garment_voxel_m)
+    scan, labels = scan_surfaces(
+        load_rig(stage.path / "rig.json"),
+        [surface],
+        config=config.scanner,
+        rng=np.random.default_rng([config.seed, frame_id]),
+        frame_id=frame_id,
+        time_s=frame_id / config.fps,
+    )
+    if same_topology:
+        none = np.zeros((0, 3, 3), np.float32), np.zeros(3, np.float32)
+        write_truth_frame(stage.frame_path(frame_id, folder="truth"), TruthFrame(mesh.vertices, *none, labels))
+    write_scan(stage.frame_path(frame_id, ".ply", folder="scans"), scan)
