@@ -68,7 +68,7 @@ class Demo(_Stage):
 class Synth(_Stage):
     """Simulate a garment on a moving body and scan it: a capture folder with its exact truth."""
 
-    output: Positional[Path]
+    output: Annotated[Positional[Path], arg(metavar="OUTPUT")]
     """Capture folder to write."""
     preset: Literal[*synth_config.PRESETS] = "demo"
     """What the settings below start from."""
@@ -86,9 +86,9 @@ class Synth(_Stage):
 class Scan(_Stage):
     """Scan your own mesh sequence with the virtual camera rig: a capture folder, with truth if the faces stay."""
 
-    meshes: Positional[Path]
+    meshes: Annotated[Positional[Path], arg(metavar="MESHES")]
     """Folder of mesh files, one per frame in order of name; or .npz with vertices (T, V, 3) and faces (F, 3)."""
-    output: Positional[Path]
+    output: Annotated[Positional[Path], arg(metavar="OUTPUT")]
     """Capture folder to write."""
     template: Path | None = None
     """Mesh to register later: lies on the first mesh, or is the same mesh in another pose."""
@@ -113,7 +113,7 @@ class Scan(_Stage):
 class Extract(_Stage):
     """Cut the garment out of every scan by its colour, and find its painted borders."""
 
-    capture: Positional[Path]
+    capture: Annotated[Positional[Path], arg(metavar="CAPTURE")]
     """Capture folder."""
     output: Path
     """Work folder; gets garment/."""
@@ -130,7 +130,7 @@ class Extract(_Stage):
 class Register(_Stage):
     """Register the template to every frame whose garment `extract` has cut out."""
 
-    capture: Positional[Path]
+    capture: Annotated[Positional[Path], arg(metavar="CAPTURE")]
     """Capture folder."""
     output: Path
     """Work folder; holds garment/ and gets registration/."""
@@ -157,7 +157,7 @@ class Register(_Stage):
 class Run(_Stage):
     """Run every stage on a capture: extract, register, report."""
 
-    capture: Positional[Path]
+    capture: Annotated[Positional[Path], arg(metavar="CAPTURE")]
     """Capture folder."""
     output: Path
     """Work folder."""
@@ -177,7 +177,7 @@ class Run(_Stage):
 class Report:
     """Draw the report of a registered capture, and check its metrics against limits."""
 
-    work: Positional[Path]
+    work: Annotated[Positional[Path], arg(metavar="WORK")]
     """Work folder; holds registration/ and gets report/."""
     fail_above: UseAppendAction[tuple[Annotated[str, arg(metavar="METRIC=LIMIT")], ...]] = ()
     """Exit with 1 if this metric of report/metrics.json is above the limit; may be given several times."""
@@ -197,7 +197,7 @@ class Report:
 class ConvertBody:
     """Convert a body model of the SMPL family, from your own licensed file, to a body.npz for captures."""
 
-    file: Positional[Path]
+    file: Annotated[Positional[Path], arg(metavar="FILE")]
     """SMPL, SMPL-H or SMPL-X model, .npz, or .pkl (read without running its code)."""
     output: Path
     """File to write, as body.npz in a capture folder."""

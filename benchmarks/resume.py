@@ -1,0 +1,104 @@
+"""Kill `capture4d run` at random moments, run it again, and compare the results with an uninterrupted run."""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from rich.console import Console
+
+from benchmarks.metric import Metric
+from capture4d.scans import read_capture
+from capture4d.workdir import read_json
+
+STAGES = ("garment", "registration")
+
+
+def run(
+    *,
+    quick: bool = False,
+    capture: Path | None = None,
+    kills: int = 10,
+    workers: int = 2,
+    seed: int = 0,
+) -> list[Metric]:
+    """Kill `capture4d run` with SIGKILL at random moments of its course; the same command has to finish the work.
+
+    Args:
+        quick: three kills instead of ten.
+        capture: capture folder to run on; a tiny synthetic one if absent.
+        kills: how often, each time on a fresh work folder, at a moment anywhere between start and end.
+        workers: processes of the killed run, which die with it.
+        seed: of the moments.
+    """
+    console = Console(stderr=True)
+    moments = random.Random(seed)
+    trials = min(kills, 3) if quick else kills
+    with tempfile.TemporaryDirectory(prefix="capture4d-resume-") as scratch:
+        folder = Path(scratch)
+        if capture is None:
+            capture = folder / "capture"
+            _command("synth", capture, "--preset", "tiny", "--workers", workers)
+        frames = len(read_capture(capture).frame_ids)
+
+        started = time.perf_counter()
+        _run_to_the_end(capture, folder / "whole", workers)
+        whole = time.perf_counter() - started
+        expected = _digests(folder / "whole")
+
+        same = interrupted = 0
+        for trial in range(trials):
+            work = folder / "killed"
+            alive = _kill_after(moments.uniform(0.0, whole), capture, work, workers)
+            done = len(list(work.glob("*/frames/*.npz")))
+            _run_to_the_end(capture, work, workers)
+            found = _digests(work)
+            same += found == expected
+            interrupted += alive
+            console.print(
+                f"kill {trial}: after {done} of {len(STAGES) * frames} frames, same digests: {found == expected}"
+            )
+            shutil.rmtree(work)
+    return [
+        Metric("kills", interrupted, "runs", "higher"),
+        Metric("same_digest_share", same / trials, "", "higher"),
+    ]
+
+
+def _arguments(*words: object) -> list[str]:
+    return [sys.executable, "-m", "capture4d", *map(str, words)]
+
+
+def _command(*words: object) -> None:
+    subprocess.run(_arguments(*words), check=True, stdout=subprocess.DEVNULL)
+
+
+def _run_to_the_end(capture: Path, work: Path, workers: int) -> None:
+    _command("run", capture, "--output", work, "--workers", workers)
+
+
+def _kill_after(seconds: float, capture: Path, work: Path, workers: int) -> bool:
+    """Start a run and kill it, and only it, after a time; whether it was still at work."""
+    process = subprocess.Popen(
+        _arguments("run", capture, "--output", work, "--workers", workers),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        process.wait(timeout=seconds)
+    except subprocess.TimeoutExpired:
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+        return True
+    return False
+
+
+def _digests(work: Path) -> list[str]:
+    return [read_json(work / stage / "stage.json")["digest"] for stage in STAGES]
