@@ -44,6 +44,7 @@ def run(capture: Path, output: Path, *, workers: int = 1, overwrite: bool = Fals
         schema=SCHEMA,
         config=ExtractionSettings(),
         upstream={"capture": capture_digest(description)},
+        sources={"capture": capture},
         overwrite=overwrite,
     )
     first = description.frame_ids[0]

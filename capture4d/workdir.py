@@ -206,6 +206,7 @@ def open_stage(
     schema: int,
     config: Any,
     upstream: Mapping[str, str],
+    sources: Mapping[str, Path] | None = None,
     overwrite: bool = False,
 ) -> Stage:
     """Open an output folder, new or to be continued.
@@ -215,6 +216,7 @@ def open_stage(
         schema: number of the output's format; a change makes old output unusable.
         config: frozen dataclass of everything that decides the result (so not the number of workers).
         upstream: digest of each input, by name.
+        sources: where the inputs lie, for later stages and for people. Inputs may be moved, so this decides nothing.
         overwrite: start clean; deletes everything in the folder, if it is this stage's.
     Raises:
         InputError: the folder holds something else, or this stage made with other settings or from other inputs.
@@ -245,7 +247,8 @@ def open_stage(
         started = existing.get("started", _now())
     else:
         started = _now()
-    record = {**settings, "status": "running", "started": started}
+    places = {name: str(path.resolve()) for name, path in (sources or {}).items()}
+    record = {**settings, "sources": places, "status": "running", "started": started}
     if existing is None or existing.get("status") != "running":
         write_json(record_path, record)
     return Stage(folder, record)
