@@ -352,38 +352,46 @@ def run_jobs(
                 advance(units(job) if units else 1)
                 yield result
             return
+        before = set(multiprocessing.active_children())
         pool = ProcessPoolExecutor(
             min(workers, len(jobs)), multiprocessing.get_context("spawn"), initializer=_start_worker
         )
-        interrupted = False
         try:
-            with _one_thread_each():
+            with _worker_environment():
                 futures: dict[Future[Result], Job] = {pool.submit(function, job): job for job in jobs}
             for future in as_completed(futures):
                 result = future.result()
                 advance(units(futures[future]) if units else 1)
                 yield result
-        except BrokenProcessPool:
-            raise WorkerDied(
-                f"{label}: a worker process was killed, perhaps for want of memory; finished frames are kept, "
-                "the same command goes on (with fewer --workers if memory is short)"
-            ) from None
-        except KeyboardInterrupt:
-            interrupted = True
+        except BaseException as error:
+            for worker in set(multiprocessing.active_children()) - before:
+                worker.kill()  # files are whole or absent, so there is nothing to wait for
+            if isinstance(error, BrokenProcessPool):
+                raise WorkerDied(
+                    f"{label}: a worker process was killed, perhaps for want of memory; finished frames are kept, "
+                    "the same command goes on (with fewer --workers if memory is short)"
+                ) from None
             raise
         finally:
-            pool.shutdown(wait=not interrupted, cancel_futures=True)
+            pool.shutdown(wait=True, cancel_futures=True)
 
 
 @contextlib.contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """Processes started meanwhile find one thread in their environment, before they load any numerical library."""
+def _worker_environment() -> Iterator[None]:
+    """Processes started meanwhile leave Ctrl-C to this one, and compute on one thread.
+
+    Numerical libraries read these variables as they load; an ignored signal is inherited.
+    """
     variables = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(dict.fromkeys(variables, "1"))
+    on_main_thread = threading.current_thread() is threading.main_thread()
+    answer = signal.signal(signal.SIGINT, signal.SIG_IGN) if on_main_thread else None
     try:
         yield
     finally:
+        if on_main_thread:
+            signal.signal(signal.SIGINT, answer)
         for name, value in before.items():
             if value is None:
                 del os.environ[name]
@@ -392,8 +400,7 @@ def _one_thread_each() -> Iterator[None]:
 
 
 def _start_worker() -> None:
-    """Leave Ctrl-C to the parent, and end with it however it ends."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """End with the parent, however it ends."""
     parent = multiprocessing.parent_process()
     assert parent is not None
 

@@ -271,9 +271,7 @@ def _run(arguments: list[str]) -> int:
             raise
         return _complain(str(error))
     except KeyboardInterrupt:
-        _complain("interrupted; finished frames are kept, the same command goes on")
-        sys.stdout.flush()
-        os._exit(130)  # a plain exit would wait for the workers; these end with their parent
+        return _complain("interrupted; finished frames are kept, the same command goes on", code=130)
 
 
 def _parse(name: str, arguments: list[str]) -> Any:
