@@ -18,6 +18,11 @@ __all__ = ["obj_bytes", "read_obj"]
 
 
 def read_obj(path: Path) -> MeshFile:
+    """Read an OBJ file; `capture4d.mesh_files.read_mesh` is the way in.
+
+    Raises:
+        InputError: names the file and the line.
+    """
     vertices: list[list[float]] = []
     texture: list[list[float]] = []
     corners: list[int] = []

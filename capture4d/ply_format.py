@@ -51,8 +51,23 @@ class _Element:
     columns: dict[str, Any]
     """By property: (count,) for a value, (count, n) for lists of equal length, else a list of arrays."""
 
+    def __post_init__(self) -> None:
+        if self.count < 0:
+            raise ValueError(self.count)
 
+    def add(self, name: str, kind: str, length: str) -> None:
+        if any(name == other for other, _, _ in self.properties):
+            raise ValueError(name)
+        self.properties.append((name, kind, length))
+
+
+@np.errstate(invalid="ignore")  # NaN and its kin are found, and named, once they are vertices or indices
 def read_ply(path: Path) -> MeshFile:
+    """Read a PLY file; `capture4d.mesh_files.read_mesh` is the way in.
+
+    Raises:
+        InputError: the file is damaged or cut off; the message does not name it.
+    """
     head, _, body = path.read_bytes().partition(b"end_header")
     elements, order = _header(head)
     body = body[2:] if body[:2] == b"\r\n" else body[1:]
@@ -99,9 +114,9 @@ def _header(head: bytes) -> tuple[list[_Element], str]:
                 case ["element", name, count]:
                     elements.append(_Element(name, int(count), [], {}))
                 case ["property", "list", length, kind, name]:
-                    elements[-1].properties.append((name, _TYPES[kind], _TYPES[length]))
+                    elements[-1].add(name, _TYPES[kind], _TYPES[length])
                 case ["property", kind, name]:
-                    elements[-1].properties.append((name, _TYPES[kind], ""))
+                    elements[-1].add(name, _TYPES[kind], "")
         except (KeyError, ValueError, IndexError):
             raise InputError(f"damaged header, cannot read '{line.strip()}'") from None
     if order is None or not elements:
@@ -126,6 +141,8 @@ def _equal_records(element: _Element, body: bytes, offset: int, order: str) -> i
             if size + step > len(body):
                 return None
             entries = int(np.frombuffer(body, order + length, 1, size)[0])
+            if entries < 0:
+                return None
             fields.append((f"{name} length", order + length))
             size += step
         fields.append((name, order + kind, (entries,)) if length else (name, order + kind))
@@ -156,6 +173,8 @@ def _single_records(element: _Element, body: bytes, offset: int, order: str) -> 
                 if length:
                     entries = int(np.frombuffer(body, length, 1, offset)[0])
                     offset += length.itemsize
+                    if entries < 0:
+                        raise ValueError(entries)
                 rows[name].append(np.frombuffer(body, kind, entries, offset))
                 offset += kind.itemsize * entries
     except ValueError:
@@ -186,9 +205,9 @@ def _records_ascii(elements: list[_Element], body: bytes) -> None:
             for name, kind, length in element.properties:
                 entries = 1
                 if length:
-                    entries = int(numbers[offset]) if offset < len(numbers) else 1
+                    entries = int(np.nan_to_num(numbers[offset], nan=-1)) if offset < len(numbers) else 1
                     offset += 1
-                if offset + entries > len(numbers):
+                if entries < 0 or offset + entries > len(numbers):
                     raise _cut_off(element, row)
                 rows[name].append(numbers[offset : offset + entries].astype(kind))
                 offset += entries

@@ -46,6 +46,8 @@ def polygon_mesh(
     vertices: np.ndarray, corners: np.ndarray, sizes: np.ndarray, corner_uv: np.ndarray | None
 ) -> tuple[Mesh, np.ndarray | None]:
     """Mesh and polygon sizes from the flat list of all polygon corners."""
+    if sizes.size and sizes.min() < 3:
+        raise InputError(f"face {int(sizes.argmin())}: expected at least 3 corners, found {sizes.min()}")
     fan = fan_corners(sizes)
     uv = None if corner_uv is None else corner_uv[fan].astype(np.float32)
     if corners.size and (corners.min() < 0 or corners.max() >= len(vertices)):

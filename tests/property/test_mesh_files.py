@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from capture4d.errors import InputError
 from capture4d.mesh import boundary_edges, boundary_loops, unique_edges
 from capture4d.mesh_files import read_mesh, write_mesh
 from capture4d.types import Mesh
@@ -83,3 +84,43 @@ def test_loops_are_the_border_of_any_part_of_a_sheet(data: st.DataObject):
     assert walked == edges
     assert all(len(set(loop.tolist())) == len(loop) for loop in loops)
     assert len(edges) == 2 * len(unique_edges(faces)) - 3 * len(faces)
+
+
+def _sample_files() -> dict[str, bytes]:
+    vertices = np.random.default_rng(0).random((6, 3), np.float32)
+    faces = np.array([[0, 1, 2], [0, 2, 3], [1, 4, 5]], np.int32)
+    mesh = Mesh(vertices, faces, np.random.default_rng(1).random((3, 3, 2), np.float32))
+    files = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for suffix in (".obj", ".ply", ".glb"):
+            path = Path(folder) / f"mesh{suffix}"
+            write_mesh(path, mesh, colours=np.full((6, 3), 7, np.uint8), polygon_sizes=np.array([4, 3], np.int32))
+            files[path.name] = path.read_bytes()
+    head = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    files["text.ply"] = f"{head}element face 1\nproperty list char int vertex_indices\nend_header\n".encode() + (
+        b"0 0 0\n1 0 0\n1 1 0\n3 0 1 2\n"
+    )
+    return files
+
+
+SAMPLES = _sample_files()
+SPLICE = st.tuples(st.floats(0, 1), st.integers(0, 6), st.binary(max_size=4))
+
+
+@given(st.sampled_from(sorted(SAMPLES)), st.lists(SPLICE, min_size=1, max_size=3))
+@settings(max_examples=400, deadline=None)
+def test_a_damaged_file_is_a_mesh_or_one_line(name: str, splices: list[tuple[float, int, bytes]]):
+    data = SAMPLES[name]
+    for place, removed, inserted in splices:
+        start = int(place * len(data))
+        data = data[:start] + inserted + data[start + removed :]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / name
+        path.write_bytes(data)
+        said = ""
+        try:
+            read_mesh(path)
+        except InputError as error:
+            said = str(error)
+    assert not said or said.startswith(str(path))
+    assert "\n" not in said
