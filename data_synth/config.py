@@ -18,8 +18,8 @@ class MotionConfig:
     """A scripted clip, or random poses within joint limits (sampled)."""
     bvh: str | None = None
     """A BVH file to follow instead of a clip."""
-    first_frame: int = 0
-    """Where to start in the BVH file, in frames of the take."""
+    skip_frames: int = 0
+    """Frames to leave out at the start of the motion, 60 a second."""
 
 
 @dataclass(frozen=True)

@@ -71,19 +71,22 @@ def make_motion(
     Raises:
         InputError: an unknown clip, an unreadable BVH file, or fewer frames in it than asked for.
     """
+    wanted = config.skip_frames + frames
     if config.bvh is not None:
-        poses = retarget(shaped, read_bvh(Path(config.bvh)), fps, first_frame=config.first_frame)
+        poses = retarget(shaped, read_bvh(Path(config.bvh)), fps, first_frame=config.skip_frames)
         if len(poses.frame_ids) < frames:
             raise InputError(
-                f"{config.bvh}: expected at least {frames} frames at {fps:g} fps from frame {config.first_frame}, "
-                f"found {len(poses.frame_ids)}"
+                f"{config.bvh}: expected at least {wanted} frames at {fps:g} fps, "
+                f"found {config.skip_frames + len(poses.frame_ids)}"
             )
-        return _cut(poses, frames)
+        return _cut(poses, 0, frames)
     if config.clip == "sampled":
-        return sample_poses(shaped, fps, frames, rng)
-    if config.clip not in get_args(ClipName):
+        poses = sample_poses(shaped, fps, wanted, rng)
+    elif config.clip in CLIPS:
+        poses = scripted_clip(shaped, CLIPS[config.clip], fps, wanted, rng)
+    else:
         raise InputError(f"clip: expected one of {', '.join(get_args(ClipName))}, found {config.clip!r}")
-    return scripted_clip(shaped, CLIPS[config.clip], fps, frames, rng)
+    return _cut(poses, config.skip_frames, frames)
 
 
 def pose_sequence(
@@ -110,10 +113,11 @@ def pose_sequence(
     )
 
 
-def _cut(poses: PoseSequence, frames: int) -> PoseSequence:
+def _cut(poses: PoseSequence, start: int, frames: int) -> PoseSequence:
+    kept = slice(start, start + frames)
     return PoseSequence(
-        poses.rotations[:frames],
-        poses.translations[:frames],
+        poses.rotations[kept],
+        poses.translations[kept],
         poses.shape,
         poses.frame_ids[:frames],
         poses.fps,

@@ -203,10 +203,9 @@ class ConvertBody:
     """File to write, as body.npz in a capture folder."""
 
     def __call__(self) -> int:
-        from capture4d.body import convert_smpl
-        from capture4d.scans import save_body
+        from capture4d.body_smpl import convert_smpl
 
-        save_body(self.output, convert_smpl(self.file))
+        convert_smpl(self.file, self.output)
         print(f"body: {self.output}")
         return 0
 

@@ -1,0 +1,267 @@
+"""The synthetic scanner: is the cloth cloth, are the scans scans, and what do they cost?
+
+Two fabrics, two seeds, arms from hanging to overhead. Limits this benchmark was built against: wrinkle residual at
+least 8 deg, determinism ratio at most 0.5, flicker at most 1.3, 99 % of edges within 1.15 of their length (1.2 with
+arms overhead), at most 0.1 % of the vertices inside the body, hem within 10 mm of the cloth solved four times as hard,
+at most 2.5 and 4.5 CPU seconds a frame, scans of about 200,000 vertices within 0.2 mm and 4 deg of the truth.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.metric import Metric
+from capture4d.evaluation import scan_errors
+from capture4d.mesh import vertex_normals
+from capture4d.types import Mesh
+from capture4d.workdir import run_jobs
+from data_synth.cloth_quality import measure_cloth
+from data_synth.config import FABRICS, PRESETS, SynthConfig
+from data_synth.patterns import locate
+from data_synth.rig import bounding_sphere, capture_rig
+from data_synth.scanner import LABEL_BODY, LABEL_GARMENT, Surface, scan_surfaces
+from data_synth.simulation import dress, simulate
+from data_synth.stage import (
+    RIG_RADIUS_M,
+    Take,
+    dress_colours,
+    paint_garment,
+    prepare_take,
+    simulate_take,
+)
+from data_synth.stage import run as synthesise
+from data_synth.wrinkle_relaxation import lift
+from registration.quality import count_intersecting_faces
+
+OVERHEAD_COSINE = 0.5
+"""An upper arm that points up steeper than this is overhead."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Job:
+    config: SynthConfig
+    scan_every: int
+    converge_frames: int
+    late_start: int | None
+
+
+def run(*, quick: bool = False, frames: int = 120, workers: int = 2) -> list[Metric]:
+    """Simulate and scan takes of two fabrics with two seeds.
+
+    Args:
+        quick: one small take of 24 frames, the same keys.
+        frames: frames of each take.
+    """
+    if quick:
+        small = replace(PRESETS["tiny"], frames=24, capture_every=2)
+        jobs = [_Job(small, 12, 16, 10)]
+    else:
+        base = replace(PRESETS["tshirt-200k"], frames=frames)
+        jobs = [
+            _Job(
+                replace(base, fabric=fabric, seed=seed),
+                scan_every=max(1, frames // 8),
+                converge_frames=50 if seed == 0 else 0,
+                late_start=frames // 3 if seed == 0 else None,
+            )
+            for fabric in ("jersey", "shirt-cotton")
+            for seed in (0, 1)
+        ]
+    rows = list(run_jobs(_measure, jobs, workers=workers, label="Synthetic takes"))
+    with tempfile.TemporaryDirectory(prefix="capture4d-synthesis-") as scratch:
+        tiny = replace(PRESETS["tiny"], frames=2, capture_every=2)
+        digests = {synthesise(Path(scratch) / name, tiny, workers=1) for name in ("first", "second")}
+
+    def mean(key: str) -> float:
+        return float(np.mean([row[key] for row in rows if key in row]))
+
+    def worst(key: str) -> float:
+        return float(np.max([row[key] for row in rows if key in row]))
+
+    def least(key: str) -> float:
+        return float(np.min([row[key] for row in rows if key in row]))
+
+    return [
+        Metric("fine_vertices", least("fine_vertices"), "", "higher"),
+        Metric("wrinkle_residual_deg", least("wrinkle_residual_deg"), "deg", "higher"),
+        Metric("pose_determinism_ratio", worst("pose_determinism_ratio")),
+        Metric("flicker_ratio", worst("flicker_ratio")),
+        Metric("stretch_p99", worst("stretch_p99")),
+        Metric("stretch_p99_overhead", worst("stretch_p99_overhead")),
+        Metric("inside_body_percent", worst("inside_body_percent"), "%"),
+        Metric("inside_body_worst_frame_percent", worst("inside_body_worst_frame_percent"), "%"),
+        Metric("flagged_frames", float(sum(row["flagged_frames"] for row in rows))),
+        Metric("hem_sag_mm", worst("hem_sag_mm"), "mm"),
+        Metric("self_intersecting_faces", mean("self_intersecting_faces")),
+        Metric("sim_cpu_s", worst("sim_cpu_s"), "s/frame"),
+        Metric("scan_cpu_s", worst("scan_cpu_s"), "s/frame"),
+        Metric("scan_vertices", mean("scan_vertices"), "", "higher"),
+        Metric("scan_vertices_least", least("scan_vertices_least"), "", "higher"),
+        Metric("scan_vertices_most", worst("scan_vertices_most")),
+        Metric("scan_accuracy_median_mm", worst("scan_accuracy_median_mm"), "mm"),
+        Metric("scan_normal_deg", worst("scan_normal_deg"), "deg"),
+        Metric("hole_percent", mean("hole_percent"), "%"),
+        Metric("hole_percent_least", least("hole_percent_least"), "%", "higher"),
+        Metric("hole_percent_most", worst("hole_percent_most"), "%"),
+        Metric("same_seed_same_digest", float(len(digests) == 1), "", "higher"),
+    ]
+
+
+def _measure(job: _Job) -> dict[str, float]:
+    take = prepare_take(job.config)
+    faces = take.shaped.body.template.faces
+    started = time.process_time()
+    clip = [(index, coarse, fine) for index, coarse, fine in simulate_take(take) if fine is not None]
+    sim_cpu = time.process_time() - started
+    residuals, flickers, normals = _wrinkles(take, clip)
+    qualities = [
+        measure_cloth(take.fine, take.wrinkles, fine, take.bodies[take.lead + index].vertices(), faces)
+        for index, _, fine in clip
+    ]
+    overhead = np.array([_arms_overhead(take, index) for index, _, _ in clip])
+    stretch = np.array([quality.stretch_p99 for quality in qualities])
+    inside = np.array([quality.inside_body_percent for quality in qualities])
+    row = {
+        "fine_vertices": take.fine.vertex_count,
+        "wrinkle_residual_deg": residuals.mean(),
+        "flicker_ratio": flickers[:, 0].mean() / flickers[:, 1].mean(),
+        "stretch_p99": stretch[~overhead].max(initial=0),
+        "stretch_p99_overhead": stretch[overhead].max(initial=0),
+        "inside_body_percent": inside.mean(),
+        "inside_body_worst_frame_percent": inside.max(),
+        "flagged_frames": sum(bool(quality.reasons) for quality in qualities),
+        "self_intersecting_faces": np.mean(
+            [count_intersecting_faces(coarse, take.coarse.faces) for _, coarse, _ in clip[:: job.scan_every]]
+        ),
+        "sim_cpu_s": sim_cpu / len(clip),
+        **_scans(take, clip[job.scan_every // 2 :: job.scan_every]),
+    }
+    if job.late_start is not None:
+        row["pose_determinism_ratio"] = _determinism(job, normals) / residuals.mean()
+    if job.converge_frames:
+        row["hem_sag_mm"] = _hem_sag(take, clip, job.converge_frames)
+    return {key: float(value) for key, value in row.items()}
+
+
+def _angles(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    return np.degrees(np.arccos(np.clip(np.einsum("vc,vc->v", first, second), -1, 1)))
+
+
+def _wrinkles(take: Take, clip: list) -> tuple[np.ndarray, np.ndarray, dict[int, np.ndarray]]:
+    """Per frame: what a template at the truth cannot show, deg; and how fine and coarse normals change, deg."""
+    to_fine, fine_weights = locate(take.fine, take.template.vertex_uv)
+    to_template, template_weights = locate(take.template, take.fine.vertex_uv)
+    residuals, changes, normals = [], [], {}
+    before = None
+    for index, coarse, fine in clip:
+        normal = vertex_normals(fine.astype(float), take.fine.faces)
+        placed = np.einsum("vk,vkc->vc", fine_weights, fine[take.fine.faces[to_fine]])
+        flat = vertex_normals(placed, take.template.faces)[take.template.faces[to_template]]
+        flat = np.einsum("vk,vkc->vc", template_weights, flat)
+        residuals.append(_angles(normal, flat / np.linalg.norm(flat, axis=1, keepdims=True)).mean())
+        smooth = lift(take.wrinkles, coarse)[1]
+        if before is not None:
+            changes.append((_angles(normal, before[0]).mean(), _angles(smooth, before[1]).mean()))
+        before = normal, smooth
+        normals[index] = normal
+    return np.array(residuals), np.array(changes), normals
+
+
+def _arms_overhead(take: Take, index: int) -> bool:
+    body = take.bodies[take.lead + index]
+    names, joints = take.shaped.body.joint_names, take.shaped.joints
+    up = []
+    for side in "LR":
+        shoulder, elbow = names.index(f"upperarm01.{side}"), names.index(f"lowerarm01.{side}")
+        arm = body.transforms[shoulder, :3, :3] @ (joints[elbow] - joints[shoulder])
+        up.append(arm[1] / np.linalg.norm(arm))
+    return max(up) > OVERHEAD_COSINE
+
+
+def _determinism(job: _Job, normals: dict[int, np.ndarray]) -> float:
+    """Mean angle, deg, to a second simulation, dressed anew, that joins the clip a third of the way in."""
+    assert job.late_start is not None
+    take = prepare_take(job.config)
+    first = job.late_start * job.config.capture_every
+    later = prepare_take(
+        replace(
+            job.config,
+            frames=job.config.frames - job.late_start,
+            motion=replace(job.config.motion, skip_frames=first),
+        )
+    )
+    assert np.array_equal(later.fine.faces, take.fine.faces)
+    compared = []
+    for index, _, fine in simulate_take(later):
+        if fine is not None and index + first > first + (max(normals) - first) // 2:
+            compared.append(_angles(vertex_normals(fine.astype(float), take.fine.faces), normals[index + first]).mean())
+    return float(np.mean(compared))
+
+
+def _hem_sag(take: Take, clip: list, frames: int) -> float:
+    """How much lower the hem hangs than in the same cloth solved with four times the iterations, mm, largest frame."""
+    harder = replace(take.config.simulation, iterations=4 * take.config.simulation.iterations)
+    start = dress(take.shaped, take.coarse, take.pattern, take.bodies[0])
+    stop = take.lead + frames
+    fabric = FABRICS[take.config.fabric]
+    hem = take.coarse.loops["hem"]
+    usual = {index: coarse for index, coarse, _ in clip}
+    sags = [
+        usual[step - take.lead][hem, 1].mean() - coarse[hem, 1].mean()
+        for step, coarse in enumerate(simulate(take.coarse, start, take.bodies[:stop], fabric, harder))
+        if step - take.lead in usual
+    ]
+    return 1e3 * float(np.abs(sags).max())
+
+
+def _scans(take: Take, clip: list) -> dict[str, float]:
+    extent = np.array([(fine.min(axis=0), fine.max(axis=0)) for _, _, fine in clip])
+    centre, radius = bounding_sphere(extent)
+    settings = take.config.scanner
+    rig = capture_rig(
+        centre=centre,
+        radius=max(radius, RIG_RADIUS_M),
+        cameras=settings.rig.cameras,
+        image_size=settings.rig.image_size,
+        field_of_view_deg=settings.rig.field_of_view_deg,
+    )
+    body_faces = take.shaped.body.template.faces
+    vertices, accuracy, angles, holes, cpu = [], [], [], [], 0.0
+    for index, _, fine in clip:
+        surface = take.bodies[take.lead + index].vertices().astype(np.float32)
+        truth = Mesh(fine, take.fine.faces)
+        started = time.process_time()
+        scan, labels = scan_surfaces(
+            rig,
+            [
+                Surface(truth, paint_garment(take.fine), LABEL_GARMENT, settings.fusion.garment_voxel_m),
+                Surface(Mesh(surface, body_faces), dress_colours(take.shaped), LABEL_BODY, settings.fusion.body_voxel_m),
+            ],
+            config=settings,
+            rng=np.random.default_rng([take.config.seed, index]),
+        )
+        cpu += time.process_time() - started
+        garment = (labels != LABEL_BODY)[scan.mesh.faces].all(axis=1)
+        used, faces = np.unique(scan.mesh.faces[garment], return_inverse=True)
+        part = Mesh(scan.mesh.vertices[used], faces.reshape(-1, 3).astype(np.int32))
+        errors = scan_errors(part, truth)
+        vertices.append(len(scan.mesh.vertices))
+        accuracy.append(1e3 * np.median(errors.distance_m))
+        angles.append(errors.normal_deg.mean())
+        holes.append(100 * errors.hole_share)
+    return {
+        "scan_cpu_s": cpu / len(clip),
+        "scan_vertices": np.mean(vertices),
+        "scan_vertices_least": np.min(vertices),
+        "scan_vertices_most": np.max(vertices),
+        "scan_accuracy_median_mm": np.mean(accuracy),
+        "scan_normal_deg": np.mean(angles),
+        "hole_percent": np.mean(holes),
+        "hole_percent_least": np.min(holes),
+        "hole_percent_most": np.max(holes),
+    }
