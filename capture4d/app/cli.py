@@ -174,19 +174,22 @@ class Run(_Stage):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Report:
+class Report(_Stage):
     """Draw the report of a registered capture, and check its metrics against limits."""
 
     work: Annotated[Positional[Path], arg(metavar="WORK")]
     """Work folder; holds registration/ and gets report/."""
     fail_above: UseAppendAction[tuple[Annotated[str, arg(metavar="METRIC=LIMIT")], ...]] = ()
     """Exit with 1 if this metric of report/metrics.json is above the limit; may be given several times."""
+    capture: Path | None = None
+    """Capture folder, if it is not where it was when it was registered."""
 
     def __call__(self) -> int:
         from capture4d.app.pipeline import broken_limits, parse_limits, run_report
 
         limits = parse_limits(self.fail_above)
-        print(f"report: {run_report(self.work)}")
+        page = run_report(self.work, capture=self.capture, workers=self.workers, overwrite=self.overwrite)
+        print(f"report: {page}")
         broken = broken_limits(self.work, limits)
         for line in broken:
             print(f"capture4d: {line}", file=sys.stderr)

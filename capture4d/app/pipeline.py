@@ -30,14 +30,14 @@ def run_all(capture: Path, output: Path, config: RegistrationConfig, *, workers:
 
     extract(capture, output / "garment", workers=workers, overwrite=overwrite)
     register(capture, output / "garment", output / "registration", config, workers=workers, overwrite=overwrite)
-    return run_report(output)
+    return run_report(output, capture=capture, workers=workers, overwrite=overwrite)
 
 
-def run_report(work: Path) -> Path:
+def run_report(work: Path, *, capture: Path | None = None, workers: int = 1, overwrite: bool = False) -> Path:
     """Draw the report of a work folder; the path of its page."""
     from capture4d.app.report import run as report
 
-    return report(work)
+    return report(work, capture=capture, workers=workers, overwrite=overwrite)
 
 
 def parse_limits(texts: Sequence[str]) -> dict[str, float]:

@@ -264,6 +264,19 @@ def test_a_full_disk_loses_nothing(
     assert run(*extract(tube_capture, small_disk)) == 0
 
 
+def test_run_does_every_stage_and_a_second_run_nothing(
+    tube_capture: Path, work: Path, capsys: pytest.CaptureFixture[str]
+):
+    command = ("run", tube_capture, "--output", work, "--workers", "1")
+    assert run(*command) == 0
+    assert f"report: {work / 'report' / 'index.html'}" in capsys.readouterr().out
+    made = {path: path.stat().st_mtime_ns for path in work.rglob("*.npz")}
+    assert run(*command) == 0
+    assert {path: path.stat().st_mtime_ns for path in work.rglob("*.npz")} == made
+    assert run("report", work, "--fail-above", "fit_mean_mm=1.0") == 0
+    assert "no metric 'beauty'" in fails(capsys, "report", work, "--fail-above", "beauty=1")
+
+
 # --- the gate
 
 
@@ -288,7 +301,7 @@ def test_the_report_gates(
         tmp_path / "report" / "metrics.json",
         {"metrics": [{"key": key, "value": value, "unit": "mm", "better": "lower"} for key, value in values.items()]},
     )
-    monkeypatch.setattr(pipeline, "run_report", lambda work: work / "report" / "index.html")
+    monkeypatch.setattr(pipeline, "run_report", lambda work, **_: work / "report" / "index.html")
     options = [word for limit in limits for word in ("--fail-above", limit)]
     assert run("report", tmp_path, *options) == code
     assert capsys.readouterr().err.count("\n") == code
