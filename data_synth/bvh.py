@@ -174,7 +174,7 @@ def retarget(shaped: ShapedBody, bvh: Bvh, fps: float, *, first_frame: int = 0) 
     scheme = _match(bvh)
     world = bvh.world_rotations()
     duration = (len(world) - 1) * bvh.frame_time_s
-    at = np.arange(first_frame / fps, duration + 1e-9, 1 / fps)
+    at = np.arange(first_frame / fps, duration + 0.1 / fps, 1 / fps)  # files round their frame time
     if not len(at):
         raise InputError(f"{bvh.path}: expected a clip longer than {first_frame} frames, found {duration * fps:.0f}")
     times = np.arange(len(world)) * bvh.frame_time_s
