@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Int, UInt8
+from jaxtyping import UInt8
 from numba import njit
 from scipy import sparse
 from scipy.sparse import csgraph
@@ -40,6 +40,10 @@ MIN_PART = 0.005
 """Parts with a smaller share of the garment's faces are dropped."""
 FAR_SIDE = 0.6
 """A border point is at least this share of the band's width away from garment colour."""
+EROSION = 1.2
+"""Sample spacings by which fused scans stop short of an open border (measured against the synthetic scanner)."""
+EVEN_BAND = 2.0
+"""A band counts as even if its widths (20 to 90 %) differ by less than this many sample spacings."""
 
 
 class ColourNotFoundError(InputError):
@@ -73,12 +77,12 @@ def extract_garment(
     renumbered = (np.cumsum(used) - 1).astype(np.int32)
     mesh = Mesh(scan.mesh.vertices[used], renumbered[faces[mask]])
     kept = labels[used]
-    rim = _border_vertices(mesh, kept, len(paints))
+    points, paint = _border_points(mesh, kept, len(paints))
     loop_of_paint = _loops_of_paints(boundary_colours, paints)
     return GarmentScan(
         mesh=mesh,
-        boundary_points=mesh.vertices[rim],
-        boundary_loops=loop_of_paint[kept[rim] - FIRST_PAINT],
+        boundary_points=points,
+        boundary_loops=loop_of_paint[paint.astype(np.int64) - FIRST_PAINT],
         loop_names=tuple(boundary_colours),
         frame_id=scan.frame_id,
     )
@@ -143,42 +147,63 @@ def _garment_faces(faces: np.ndarray, labels: np.ndarray) -> np.ndarray:
     return inside & keep[np.maximum(part, 0)]
 
 
-def _border_vertices(mesh: Mesh, labels: np.ndarray, paints: int) -> Int[np.ndarray, " border"]:
-    """Open-edge vertices on the far side of the painted bands."""
+def _border_points(mesh: Mesh, labels: np.ndarray, paints: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points on the true border, float32, and the paint of each.
+
+    A scan ends about a sample before the surface does, and sometimes several. Where the band is of even width, each
+    open vertex is moved outwards by what is missing from that width; else by the one sample.
+    """
+    points, labels_of = [np.zeros((0, 3), np.float32)], [np.zeros(0, labels.dtype)]
     if not paints:
-        return np.zeros(0, np.int64)
-    is_open, _ = open_vertices(mesh.faces, len(mesh.vertices))
-    candidates = np.flatnonzero(is_open & (labels >= FIRST_PAINT))
-    if not len(candidates):
-        return candidates
-    depth = _depth_in_paint(mesh, labels)
-    chosen = []
+        return points[0], labels_of[0]
+    rim, inner = _across_the_paint(mesh, labels)
+    outer = mesh.vertices[rim].astype(np.float64)
+    across = outer - inner
+    width_here = np.linalg.norm(across, axis=1)
+    spacing = _spacing(mesh)
+    paint_here = labels[rim]
     for paint in range(FIRST_PAINT, FIRST_PAINT + paints):
-        own = candidates[labels[candidates] == paint]
-        reached = np.isfinite(depth[own])
-        if reached.any():
-            width = np.percentile(depth[own[reached]], 75)
-            chosen.append(own[reached & (depth[own] >= FAR_SIDE * width)])
-    return np.sort(np.concatenate(chosen)) if chosen else candidates[:0]
+        own = np.flatnonzero(paint_here == paint)
+        if not len(own):
+            continue
+        own = own[width_here[own] >= FAR_SIDE * np.percentile(width_here[own], 75)]
+        narrow, full = np.percentile(width_here[own], (20, 90))
+        missing = np.full(len(own), EROSION * spacing)
+        if full - narrow < EVEN_BAND * spacing:
+            missing = np.clip(full + 0.5 * spacing - width_here[own], 0.0, 2.5 * spacing)
+        direction = across[own] / width_here[own, None]
+        points.append((outer[own] + missing[:, None] * direction).astype(np.float32))
+        labels_of.append(np.full(len(own), paint, labels.dtype))
+    return np.concatenate(points), np.concatenate(labels_of)
 
 
-def _depth_in_paint(mesh: Mesh, labels: np.ndarray) -> np.ndarray:
-    """Distance of every painted vertex from garment colour along the surface, metres; 0 on the garment."""
-    faces = mesh.faces
+def _spacing(mesh: Mesh) -> float:
+    """Mean edge length of a sample of the faces, metres."""
+    some = mesh.faces[:: max(1, len(mesh.faces) // 2000)]
+    return float(np.linalg.norm(mesh.vertices[some[:, 0]] - mesh.vertices[some[:, 1]], axis=1).mean())
+
+
+def _across_the_paint(mesh: Mesh, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Open painted vertices that are connected to garment colour, and the nearest point of that colour for each.
+
+    Nearest along the surface: a cuff may touch the flank.
+    """
+    is_open, _ = open_vertices(mesh.faces, len(mesh.vertices))
     painted = labels >= FIRST_PAINT
-    local_faces = faces[painted[faces].any(axis=1)]
-    local, renumbered = np.unique(local_faces, return_inverse=True)
+    local, renumbered = np.unique(mesh.faces[painted[mesh.faces].any(axis=1)], return_inverse=True)
     corners = renumbered.reshape(-1, 3)
-    pairs = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
+    pairs = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
+    keys = np.unique(pairs[:, 0].astype(np.int64) * len(local) + pairs[:, 1])
+    start, end = keys // max(len(local), 1), keys % max(len(local), 1)
     positions = mesh.vertices[local].astype(np.float64)
-    length = np.maximum(np.linalg.norm(positions[pairs[:, 0]] - positions[pairs[:, 1]], axis=1), 1e-9)
-    pairs, first = np.unique(np.sort(pairs, axis=1), axis=0, return_index=True)
-    graph = sparse.csr_array((length[first], (pairs[:, 0], pairs[:, 1])), shape=(len(local), len(local)))
-    depth = np.full(len(labels), np.inf)
+    length = np.maximum(np.linalg.norm(positions[start] - positions[end], axis=1), 1e-9)
+    graph = sparse.csr_array((length, (start, end)), shape=(len(local), len(local)))
     sources = np.flatnonzero(~painted[local])
-    if len(sources):
-        depth[local] = csgraph.dijkstra(graph, directed=False, indices=sources, min_only=True)
-    return depth
+    if not len(sources):
+        return np.zeros(0, np.int64), np.zeros((0, 3))
+    _, _, source = csgraph.dijkstra(graph, directed=False, indices=sources, min_only=True, return_predecessors=True)
+    rim = np.flatnonzero(is_open[local] & painted[local] & (source >= 0))
+    return local[rim], positions[source[rim]]
 
 
 def _loops_of_paints(boundary_colours: Mapping[str, Colour], paints: tuple[Colour, ...]) -> np.ndarray:

@@ -106,7 +106,7 @@ class Schedule:
     smooth: tuple[float, float] = (0.0, 0.0)
     """Weight of E_smooth (coarse) or of the displacement's bending (dense)."""
     stretch: tuple[float, float] = (0.0, 0.0)
-    """Weight of the edge lengths against the template's (dense stage)."""
+    """Weight of lengths against the template's: between nodes (coarse), along edges (dense)."""
     anchor: tuple[float, float] = (0.0, 0.0)
     """Weight of the tangential distance to the start (dense stage)."""
     boundary: tuple[float, float] = (2.0, 2.0)
@@ -117,9 +117,9 @@ class Schedule:
 class CoarseConfig:
     """The deformation graph stage."""
 
-    cold: Schedule = Schedule(8, (0.12, 0.05), rigid=(100.0, 3.0), smooth=(60.0, 2.0))
+    cold: Schedule = Schedule(8, (0.12, 0.05), rigid=(100.0, 3.0), smooth=(60.0, 2.0), stretch=(100.0, 10.0))
     """From a skinned template or another distant start."""
-    warm: Schedule = Schedule(2, (0.05, 0.03), rigid=(50.0, 50.0), smooth=(60.0, 60.0))
+    warm: Schedule = Schedule(2, (0.05, 0.03), rigid=(50.0, 50.0), smooth=(60.0, 60.0), stretch=(10.0, 10.0))
     """From the frame before."""
 
 
@@ -127,13 +127,13 @@ class CoarseConfig:
 class DenseConfig:
     """The per-vertex stage."""
 
-    cold: Schedule = Schedule(6, (0.03, 0.012), smooth=(0.05, 0.02), stretch=(0.03, 0.03), boundary=(0.1, 0.1))
+    cold: Schedule = Schedule(10, (0.03, 0.012), smooth=(0.05, 0.02), stretch=(10.0, 0.05), boundary=(0.3, 0.1))
     """After a cold coarse stage."""
-    warm: Schedule = Schedule(3, (0.02, 0.012), smooth=(0.03, 0.02), stretch=(0.03, 0.03), boundary=(0.1, 0.1))
+    warm: Schedule = Schedule(3, (0.02, 0.012), smooth=(0.03, 0.02), stretch=(10.0, 0.05), boundary=(0.2, 0.1))
     """After a warm coarse stage."""
     plasticity: float = 0.5
     """Share of the bending that is forgiven between steps: 0 keeps the shape of the coarse stage, 1 only damps change."""
-    compression: float = 0.2
+    compression: float = 0.5
     """Share of the stretch weight that resists shortening: folds finer than the template's edges shorten them."""
 
 
@@ -141,13 +141,13 @@ class DenseConfig:
 class SequenceConfig:
     """How a take is cut up and where each frame starts."""
 
-    segment: int = 30
-    """Frames per segment; segments start from keyframes and run in parallel."""
+    keyframe_spacing: int = 10
+    """Every n-th frame is a keyframe, registered from the keyframe before; the frames between run in parallel."""
     start: Literal["best", "previous", "skinned"] = "best"
-    """Start of a frame inside a segment: the frame before, the skinned pose, or whichever is nearer to the scan."""
-    carry: float = 1.0
-    """Share of the offsets from the skinned pose that a frame hands to the next, in the pose-normalised space."""
-    cold_above: float = 0.008
+    """Start of a frame: the frame before, the skinned pose, or whichever is nearer to the scan."""
+    carry: float = 0.97
+    """Share of the offsets from the skinned pose that a frame hands to the next, in the rest pose."""
+    cold_above: float = 0.004
     """Take the cold schedule when the median distance from start to scan exceeds this, metres."""
 
 

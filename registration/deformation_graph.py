@@ -21,7 +21,7 @@ from scipy.sparse import csgraph
 from capture4d.mesh import connected_components, unique_edges
 from registration.solver import Rows
 
-__all__ = ["DeformationGraph", "build_graph", "identity_nodes", "rows_of_vertices", "smooth_rows"]
+__all__ = ["DeformationGraph", "build_graph", "identity_nodes", "node_edge_rows", "rows_of_vertices", "smooth_rows"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,6 +109,15 @@ def smooth_rows(
     coefficients[:, 0, :3], coefficients[:, 0, 3], coefficients[:, 1, 3] = step, 1.0, -1.0
     offsets = np.arange(0, 2 * len(graph.edges) + 1, 2, dtype=np.int32)
     return Rows(offsets, graph.edges.reshape(-1).astype(np.int32), coefficients.reshape(-1, 4)), -step
+
+
+def node_edge_rows(graph: DeformationGraph) -> tuple[Rows, Int32[np.ndarray, "pairs 2"]]:
+    """Rows of t_j - t_i for every pair of neighbouring nodes i < j, and the pairs."""
+    pairs = graph.edges[graph.edges[:, 0] < graph.edges[:, 1]]
+    coefficients = np.zeros((len(pairs), 2, 4))
+    coefficients[:, 0, 3], coefficients[:, 1, 3] = -1.0, 1.0
+    offsets = np.arange(0, 2 * len(pairs) + 1, 2, dtype=np.int32)
+    return Rows(offsets, pairs.reshape(-1).astype(np.int32), coefficients.reshape(-1, 4)), pairs
 
 
 def _surface_graph(vertices: np.ndarray, faces: np.ndarray) -> sparse.csr_array:

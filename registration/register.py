@@ -16,7 +16,7 @@ from capture4d.types import GarmentScan
 from registration.boundary import BorderTargets, border_targets, tangent_free_metric
 from registration.config import BoundaryRule, RegistrationConfig, Schedule
 from registration.correspondences import ScanSurface, match, match_both_ways, mesh_normals, prepare_scan
-from registration.deformation_graph import identity_nodes, rows_of_vertices, smooth_rows
+from registration.deformation_graph import identity_nodes, node_edge_rows, rows_of_vertices, smooth_rows
 from registration.energies import edge_vectors, plane_metric, rigid_term, stretch_metric, tangential_metric
 from registration.solver import Rows, RowTerm, gauss_newton_step
 from registration.template import TemplateAnalysis
@@ -113,6 +113,9 @@ def _coarse_stage(
     data_rows = rows_of_vertices(graph, start, subset)
     border_rows = rows_of_vertices(graph, start, analysis.border.vertices)
     node_rows, node_constant = smooth_rows(graph, start)
+    pair_rows, pairs = node_edge_rows(graph)
+    pair_start = edge_vectors(start[graph.nodes], pairs)
+    pair_rest = np.linalg.norm(edge_vectors(analysis.rest[graph.nodes], pairs), axis=1)
     iterations = 0
     vertices = start
     for step in range(schedule.steps):
@@ -130,6 +133,12 @@ def _coarse_stage(
         smooth = _anneal(schedule.smooth, *at) / max(len(node_constant), 1)
         metric = np.broadcast_to(smooth * np.eye(3), (len(node_constant), 3, 3))
         terms.append(RowTerm(node_rows, np.ascontiguousarray(metric), node_rows.apply(nodes) + node_constant))
+        stretch = _anneal(schedule.stretch, *at)
+        if stretch > 0.0:
+            metric, excess = stretch_metric(
+                pair_start + pair_rows.apply(nodes), pair_rest, weight=stretch, compression=config.dense.compression
+            )
+            terms.append(RowTerm(pair_rows, metric, excess))
         rigid = rigid_term(nodes, weight=_anneal(schedule.rigid, *at), spacing=graph.spacing)
         change, used = gauss_newton_step(
             terms, rigid, count, damping=1e-6,

@@ -1,15 +1,16 @@
 """A take, frame after frame: where each frame starts from, and what happens when one fails.
 
-With poses, the take is cut into segments that start from keyframes: the first frame of a segment starts cold from the
-skinned template, so segments need nothing from each other, run in parallel, and give the same result on any number of
-workers. Inside a segment a frame starts from the best of three predictions, measured by their distance to the scan:
+With poses, every n-th frame is a keyframe. Keyframes are registered first, one from the other and with the cold schedule,
+so that sliding cannot build up frame by frame; then the frames between, each run of them from its keyframe. Runs need
+nothing from each other, go in parallel, and give the same result on any number of workers. A frame starts from the best
+of three predictions, measured by their distance to its scan:
 
     carried    the frame before, taken to the rest pose by inverse skinning and skinned to this frame's pose
     previous   the frame before as it is
     skinned    the template skinned to this frame's pose
 
 Where the blended skinning matrix is near singular the inverse means nothing, and the vertex keeps its template offset.
-Without poses there is one segment, and its first frame starts from the template as it lies.
+Without poses each frame starts from the one before, and the first from the template as it lies.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from registration.quality import FrameQuality, assess
 from registration.register import FrameScan, prepare_frame, register_frame
 from registration.template import TemplateAnalysis
 
-__all__ = ["FrameResult", "Mover", "register_segment", "segments"]
+__all__ = ["FrameResult", "Mover", "register_run", "runs_between_keyframes"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,41 +86,47 @@ class Mover:
         return skin(self.rest + share * offset, self.skin_weights, transforms)
 
 
-def segments(frame_ids: Sequence[int], *, length: int, posed: bool) -> list[tuple[int, ...]]:
-    """Frames cut into runs of `length`; one run if nothing but the frame before can start a frame."""
-    if not posed:
-        return [tuple(frame_ids)]
-    return [tuple(frame_ids[first : first + length]) for first in range(0, len(frame_ids), length)]
+def runs_between_keyframes(frames: int, *, spacing: int, posed: bool) -> tuple[range, list[range]]:
+    """The keyframes, and runs that each begin with one, as positions in the take.
+
+    Without poses nothing but the frame before can start a frame: one keyframe, one run.
+    """
+    step = spacing if posed else max(frames, 1)
+    return range(0, frames, step), [range(first, min(first + step, frames)) for first in range(0, frames, step)]
 
 
-def register_segment(
+def register_run(
     analysis: TemplateAnalysis,
     mover: Mover | None,
+    positions: Sequence[int],
     frame_ids: Sequence[int],
-    first_index: int,
     *,
+    keyframes: bool,
     load: Callable[[int], GarmentScan],
     done: Callable[[int], tuple[np.ndarray, bool] | None],
     config: RegistrationConfig,
 ) -> Iterator[FrameResult]:
-    """Register the frames of one segment in order; yields those that were not done before.
+    """Register frames one from the other; yields those that were not done before.
 
     Args:
-        first_index: position of the segment's first frame in the take.
+        positions: of the frames in the take, ascending.
+        frame_ids: of the whole take.
+        keyframes: take the cold schedule for every frame.
         load: the garment scan of a frame; may raise InputError, which flags the frame.
-        done: vertices of a frame that an earlier run has finished and whether they may be built upon, or None.
+        done: vertices of a frame that was finished earlier and whether they may be built upon, or None.
     """
     before: tuple[np.ndarray, int] | None = None
-    for index, frame_id in enumerate(frame_ids, start=first_index):
+    for position in positions:
+        frame_id = frame_ids[position]
         earlier = done(frame_id)
         if earlier is not None:
             vertices, sound = earlier
         else:
-            result = _register_one(analysis, mover, frame_id, index, before, load, config)
+            result = _register_one(analysis, mover, frame_id, position, before, keyframes, load, config)
             yield result
             vertices, sound = result.vertices, result.quality.verdict != "failed"
         if sound:
-            before = (vertices, index)
+            before = (vertices, position)
 
 
 def _register_one(
@@ -128,6 +135,7 @@ def _register_one(
     frame_id: int,
     index: int,
     before: tuple[np.ndarray, int] | None,
+    keyframe: bool,
     load: Callable[[int], GarmentScan],
     config: RegistrationConfig,
 ) -> FrameResult:
@@ -136,7 +144,7 @@ def _register_one(
     name, start = next(iter(candidates.items()))
     try:
         scan = prepare_frame(analysis, load(frame_id), config)
-        name, start, schedule = _choose(analysis, scan, candidates, before is None, config)
+        name, start, schedule = _choose(analysis, scan, candidates, keyframe or before is None, config)
         fitted = register_frame(analysis, scan, start, config=config, schedule=schedule)
     except InputError as error:
         return FrameResult(
@@ -172,7 +180,7 @@ def _choose(
     analysis: TemplateAnalysis,
     scan: FrameScan,
     candidates: dict[str, np.ndarray],
-    first: bool,
+    distant: bool,
     config: RegistrationConfig,
 ) -> tuple[str, np.ndarray, Literal["cold", "warm"]]:
     """The prediction nearest to the scan, and whether it is near enough for the warm schedule."""
@@ -181,7 +189,7 @@ def _choose(
         name: float(np.median(scan.surface.tree.query(vertices[subset])[0])) for name, vertices in candidates.items()
     }
     name = min(misfit, key=lambda key: misfit[key])
-    return name, candidates[name], "cold" if first or misfit[name] > config.sequence.cold_above else "warm"
+    return name, candidates[name], "cold" if distant or misfit[name] > config.sequence.cold_above else "warm"
 
 
 def _failure(count: int, reason: str) -> FrameQuality:

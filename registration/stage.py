@@ -35,7 +35,7 @@ from capture4d.workdir import (
     write_npz,
 )
 from registration.config import RegistrationConfig
-from registration.sequence import FrameResult, Mover, register_segment, segments
+from registration.sequence import FrameResult, Mover, register_run, runs_between_keyframes
 from registration.template import TemplateAnalysis, analyse_template
 
 __all__ = ["load_registration", "run"]
@@ -45,14 +45,14 @@ VERDICTS = ("good", "check", "failed")
 
 
 @dataclass(frozen=True, slots=True)
-class SegmentJob:
-    """A run of frames for one worker."""
+class RunJob:
+    """Frames for one worker, each starting from the one before."""
 
     capture: Path
     garment_folder: Path
     stage: Stage
-    first_index: int
-    frame_ids: tuple[int, ...]
+    positions: range
+    keyframes: bool
 
 
 def run(
@@ -80,21 +80,21 @@ def run(
         raise InputError(f"{capture}: expected a template with open borders, for the scans have painted ones; found none")
     if not (output / "garment.npz").is_file():
         save_garment(output / "garment.npz", garment)
-    poses = read_poses(description)
-    posed = Mover.create(_light_analysis(capture, config), read_body(description), poses) is not None
-    pending = set(stage.pending(description.frame_ids))
-    runs = segments(description.frame_ids, length=config.sequence.segment, posed=posed)
-    jobs = []
-    index = 0
-    for frame_ids in runs:
-        if pending.intersection(frame_ids):
-            jobs.append(SegmentJob(capture, garment_folder, stage, index, frame_ids))
-        index += len(frame_ids)
-    for _ in run_jobs(
-        partial(_run_segment, config), jobs, workers=workers, label="register", units=lambda job: len(job.frame_ids),
-        finished=lambda: len(description.frame_ids) - len(stage.pending(description.frame_ids)),
-    ):  # fmt: skip
-        pass
+    mover = Mover.create(_analysis(capture, config), read_body(description), read_poses(description))
+    frame_ids = description.frame_ids
+    keyframes, runs = runs_between_keyframes(
+        len(frame_ids), spacing=config.sequence.keyframe_spacing, posed=mover is not None
+    )
+    jobs = [RunJob(capture, garment_folder, stage, keyframes, True)]
+    for label in ("register keyframes", "register"):
+        pending = set(stage.pending(frame_ids))
+        left = [job for job in jobs if pending.intersection(frame_ids[position] for position in job.positions)]
+        for _ in run_jobs(
+            partial(_register_job, config), left, workers=workers, label=label, units=lambda job: len(job.positions),
+            finished=lambda: len(frame_ids) - len(stage.pending(frame_ids)),
+        ):  # fmt: skip
+            pass
+        jobs = [RunJob(capture, garment_folder, stage, positions, False) for positions in runs]
     return _collect(stage, description.frame_ids)
 
 
@@ -111,17 +111,18 @@ def load_registration(folder: Path) -> RegisteredSequence:
 
 
 @lru_cache(maxsize=2)
-def _light_analysis(capture: Path, config: RegistrationConfig) -> TemplateAnalysis:
+def _analysis(capture: Path, config: RegistrationConfig) -> TemplateAnalysis:
     """One analysis per process, template and settings."""
     return analyse_template(read_template(read_capture(capture)), config)
 
 
-def _run_segment(config: RegistrationConfig, job: SegmentJob) -> int:
-    """Register and write the frames of a segment; how many were new."""
+def _register_job(config: RegistrationConfig, job: RunJob) -> int:
+    """Register and write the frames of a run; how many were new."""
     description = read_capture(job.capture)
-    analysis = _light_analysis(job.capture, config)
+    frame_ids = description.frame_ids
+    analysis = _analysis(job.capture, config)
     mover = Mover.create(analysis, read_body(description), read_poses(description))
-    pending = set(job.stage.pending(job.frame_ids))
+    pending = set(job.stage.pending([frame_ids[position] for position in job.positions]))
 
     def done(frame_id: int) -> tuple[np.ndarray, bool] | None:
         if frame_id in pending:
@@ -129,11 +130,12 @@ def _run_segment(config: RegistrationConfig, job: SegmentJob) -> int:
         with np.load(job.stage.frame_path(frame_id), allow_pickle=False) as arrays:
             return arrays["vertices"], VERDICTS[int(arrays["verdict"])] != "failed"
 
-    results = register_segment(
+    results = register_run(
         analysis,
         mover,
-        job.frame_ids,
-        job.first_index,
+        job.positions,
+        frame_ids,
+        keyframes=job.keyframes,
         load=lambda frame_id: load_garment_scan(job.garment_folder / "frames" / f"{frame_id:06d}.npz", frame_id),
         done=done,
         config=config,

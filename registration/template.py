@@ -9,12 +9,16 @@ from jaxtyping import Float64, Int32
 
 from capture4d.errors import InputError
 from capture4d.mesh import unique_edges
-from capture4d.types import Garment
+from capture4d.types import Garment, Mesh
 from registration.config import RegistrationConfig
 from registration.deformation_graph import DeformationGraph, build_graph
 from registration.solver import Rows
 
 __all__ = ["Border", "TemplateAnalysis", "analyse_template"]
+
+
+PATTERN_RATIO = (0.7, 1.4)
+"""Edge lengths on the UVs over those on the mesh between which UVs can be a sewing pattern in metres."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,7 +78,7 @@ def analyse_template(garment: Garment, config: RegistrationConfig) -> TemplateAn
     )
     border = _border(garment)
     edges = unique_edges(faces)
-    lengths = np.linalg.norm(rest[edges[:, 1]] - rest[edges[:, 0]], axis=1)
+    lengths = rest_lengths(garment.template, edges)
     return TemplateAnalysis(
         garment=garment,
         faces=faces,
@@ -90,6 +94,28 @@ def analyse_template(garment: Garment, config: RegistrationConfig) -> TemplateAn
         fan_faces=(np.argsort(faces.reshape(-1), kind="stable") // 3).astype(np.int32),
         laplacian_rows=_laplacian_rows(edges, faces, len(rest)),
     )
+
+
+def rest_lengths(template: Mesh, edges: Int32[np.ndarray, "edges 2"]) -> Float64[np.ndarray, " edges"]:
+    """Lengths that the cloth wants: on the sewing pattern where the UVs are one in metres, else on the template.
+
+    A draped template is stretched here and folded there; the pattern is not. UVs count as a pattern in metres if most
+    of their lengths are near those of the mesh. On a seam both panels are averaged.
+    """
+    vertices, faces = template.vertices.astype(np.float64), template.faces
+    on_mesh = np.linalg.norm(vertices[edges[:, 1]] - vertices[edges[:, 0]], axis=1)
+    if template.uv is None:
+        return on_mesh
+    corners = np.array([[0, 1], [1, 2], [2, 0]])
+    uv = template.uv.astype(np.float64)
+    lengths = np.linalg.norm(uv[:, corners[:, 0]] - uv[:, corners[:, 1]], axis=2).reshape(-1)
+    pairs = np.sort(faces[:, corners].reshape(-1, 2), axis=1).astype(np.int64)
+    count = len(vertices)
+    edge_of = np.searchsorted(edges[:, 0].astype(np.int64) * count + edges[:, 1], pairs[:, 0] * count + pairs[:, 1])
+    on_pattern = np.bincount(edge_of, lengths) / np.bincount(edge_of)
+    ratio = on_pattern / np.maximum(on_mesh, 1e-12)
+    alike = (ratio > PATTERN_RATIO[0]) & (ratio < PATTERN_RATIO[1])
+    return on_pattern if alike.mean() > 0.95 else on_mesh
 
 
 def _border(garment: Garment) -> Border:
