@@ -51,7 +51,7 @@ class Fabric:
     """Coulomb coefficient between cloth and body."""
     shrink: tuple[float, float] = (0.93, 0.98)
     """Size of the coarse rest pattern across and along the grain; the rest becomes fine folds."""
-    fold_bending: float = 0.2
+    fold_bending: float = 0.17
     """Bending gain of the wrinkle mesh, 0 to 1: more makes wider folds."""
 
 
@@ -105,11 +105,11 @@ class RelaxationConfig:
     warm_start: float = 0.93
     """Share of the folds carried over from the frame before; the rest is the imperfection. 1 moves most smoothly, but
     then the folds are an accident of the start; below 0.5 they shimmer."""
-    imperfection_m: float = 0.004
+    imperfection_m: float = 0.003
     """Standard deviation of the imperfection, metres. Larger makes the folds follow the pose, not the history: with
     1 mm two runs that meet differ by 0.45 of the residual at warm start 0.85, with 2 mm by 0.32."""
-    imperfection_width_m: float = 0.0125
-    """Width of the imperfection; white noise would fold the cloth into crepe."""
+    imperfection_width_m: tuple[float, float] = (0.0085, 0.045)
+    """Width of the imperfection across and along the grain; white noise would fold the cloth into crepe."""
 
 
 @dataclass(frozen=True)

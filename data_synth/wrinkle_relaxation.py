@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from scipy.sparse import csr_array
+from scipy.ndimage import gaussian_filter, map_coordinates
 
 from capture4d.mesh import unique_edges, vertex_adjacency, vertex_normals
 from capture4d.open3d_loading import import_open3d
@@ -26,6 +26,8 @@ from data_synth.config import Fabric, RelaxationConfig
 from data_synth.patterns import PanelMesh, locate
 
 __all__ = ["BodyPlanes", "WrinkleMesh", "body_planes", "relax_frame", "wrinkle_mesh"]
+
+IMPERFECTION_PIXEL_M = 0.003
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,7 +78,6 @@ def wrinkle_mesh(
     edges, rest_lengths = _rest_lengths(fine)
     hinges, weights = _hinges(fine)
     adjacency = vertex_adjacency(fine.faces, fine.vertex_count)
-    spacing = float(np.median(rest_lengths))
     neighbour = adjacency.indices[adjacency.indptr[:-1]]
     return WrinkleMesh(
         faces=fine.faces,
@@ -88,7 +89,7 @@ def wrinkle_mesh(
         rest_lengths=rest_lengths.astype(np.float32),
         hinges=hinges.astype(np.int32),
         hinge_weights=weights.astype(np.float32),
-        imperfection=_smooth_noise(adjacency, config.imperfection_width_m / spacing, rng) * config.imperfection_m,
+        imperfection=_imperfection(fine.vertex_uv, config, rng),
     )
 
 
@@ -143,14 +144,17 @@ def _hinges(mesh: PanelMesh) -> tuple[np.ndarray, np.ndarray]:
     return hinges, np.column_stack([weights, 1 / (weights**2).sum(axis=1)])
 
 
-def _smooth_noise(adjacency: csr_array, width: float, rng: np.random.Generator) -> np.ndarray:
-    """White noise diffused over about `width` edge lengths, unit variance, (V,) float32."""
-    degree = np.diff(adjacency.indptr)
-    mean = csr_array((np.repeat(1 / degree, degree), adjacency.indices, adjacency.indptr), shape=adjacency.shape)
-    noise = rng.standard_normal(adjacency.shape[0])
-    for _ in range(max(1, round(2 * width**2))):
-        noise = 0.5 * (noise + mean @ noise)
-    return ((noise - noise.mean()) / noise.std()).astype(np.float32)
+def _imperfection(plane: np.ndarray, config: RelaxationConfig, rng: np.random.Generator) -> np.ndarray:
+    """Smooth noise on the pattern, longer along the grain than across, (V,) float32 metres.
+
+    Cloth folds along its grain under its own weight; noise that is as short along as across gives lumps.
+    """
+    low, high = plane.min(axis=0) - IMPERFECTION_PIXEL_M, plane.max(axis=0) + IMPERFECTION_PIXEL_M
+    shape = np.ceil((high - low) / IMPERFECTION_PIXEL_M).astype(int) + 1
+    widths = np.array(config.imperfection_width_m) / IMPERFECTION_PIXEL_M
+    noise = gaussian_filter(rng.standard_normal(shape), widths, mode="wrap")
+    values = map_coordinates(noise / noise.std(), ((plane - low) / IMPERFECTION_PIXEL_M).T, order=1)
+    return (config.imperfection_m * values).astype(np.float32)
 
 
 def lift(mesh: WrinkleMesh, coarse: np.ndarray, smoothing: float = 0.6) -> tuple[np.ndarray, np.ndarray]:
@@ -200,7 +204,6 @@ def relax_frame(
     """
     base, normals = lift(mesh, coarse)
     frames = _material_frames(mesh, base, normals)
-    planes = body_planes(base, surface, body_faces)
     offsets = np.zeros((len(base), 3))
     offsets[:, 2] = mesh.imperfection
     sweeps = config.sweeps
@@ -209,23 +212,28 @@ def relax_frame(
     else:
         offsets = config.warm_start * previous_offsets + (1 - config.warm_start) * offsets
     points = (base + np.einsum("vji,vj->vi", frames, offsets)).astype(np.float32)
-    _relax(
-        points,
-        base.astype(np.float32),
-        normals.astype(np.float32),
-        mesh.edges,
-        mesh.rest_lengths,
-        mesh.hinges,
-        mesh.hinge_weights,
-        np.float32(fabric.fold_bending),
-        np.float32(config.pull_normal),
-        np.float32(config.pull_tangential),
-        np.float32(config.radius_m),
-        planes.points.astype(np.float32),
-        planes.normals.astype(np.float32),
-        np.float32(config.body_margin_m),
-        sweeps,
-    )
+    for planes_at in (base, points):  # the body is a half plane per vertex, so it is looked up again half-way
+        planes = body_planes(planes_at, surface, body_faces)
+        _relax(
+            points,
+            base.astype(np.float32),
+            normals.astype(np.float32),
+            mesh.edges,
+            mesh.rest_lengths,
+            mesh.hinges,
+            mesh.hinge_weights,
+            np.float32(fabric.fold_bending),
+            np.float32(config.pull_normal),
+            np.float32(config.pull_tangential),
+            np.float32(config.radius_m),
+            planes.points.astype(np.float32),
+            planes.normals.astype(np.float32),
+            np.float32(config.body_margin_m),
+            (sweeps + 1) // 2,
+        )
+    planes = body_planes(points, surface, body_faces)
+    depth = np.einsum("vc,vc->v", points - planes.points, planes.normals) - 0.2 * config.body_margin_m
+    points -= (np.minimum(depth, 0)[:, None] * planes.normals).astype(np.float32)
     return points, np.einsum("vij,vj->vi", frames, points - base).astype(np.float32)
 
 
