@@ -19,7 +19,7 @@ __all__ = ["NoiseFields", "corrupt_depth", "draw_noise_fields", "periodic_gaussi
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NoiseFields:
-    """The random textures of one frame, zero mean, unit variance, repeated beyond their period so that windows are views."""
+    """One frame's random textures, zero mean, unit variance, repeated beyond their period so that windows are views."""
 
     period: int
     depth: Float32[np.ndarray, "size size"]

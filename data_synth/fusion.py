@@ -5,8 +5,6 @@ References: Curless and Levoy, A volumetric method for building complex models f
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 from scipy.sparse import coo_array
@@ -78,7 +76,7 @@ class DepthFusion:
 
 
 def _pooled(depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    """The largest depth of each 4x4 cell, at its first pixel: Open3D reads every fourth pixel when it allocates blocks."""
+    """The largest depth of each 4x4 cell at its first pixel, the only one Open3D reads when it allocates blocks."""
     height, width = (-(-size // 4) * 4 for size in depth.shape)
     padded = np.zeros((height, width), np.float32)
     padded[: depth.shape[0], : depth.shape[1]] = depth

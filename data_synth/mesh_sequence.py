@@ -55,7 +55,8 @@ def open_sequence(path: Path) -> MeshSequence:
             raise InputError(f"{path}: expected vertices of shape (frames, vertices, 3), found {shape}")
         return MeshSequence(path, dict.fromkeys(range(shape[0]), path))
     if not path.is_dir():
-        raise InputError(f"{path}: expected a folder of mesh files or an npz, found {'a file' if path.exists() else 'nothing'}")
+        found = "a file" if path.exists() else "nothing"
+        raise InputError(f"{path}: expected a folder of mesh files or an npz, found {found}")
     files: dict[int, Path] = {}
     for file in sorted(path.iterdir()):
         if file.suffix.lower() not in MESH_SUFFIXES:

@@ -14,7 +14,7 @@ from capture4d.mesh import vertex_normals
 from capture4d.open3d_loading import import_open3d
 from capture4d.types import Mesh, Rig
 
-__all__ = ["CameraImages", "NOTHING", "Surface", "SurfaceScene"]
+__all__ = ["NOTHING", "CameraImages", "Surface", "SurfaceScene"]
 
 NOTHING = 255
 """In a surface image: no surface."""

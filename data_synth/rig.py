@@ -10,6 +10,8 @@ from capture4d.types import Rig
 
 __all__ = ["bounding_sphere", "capture_rig", "look_at"]
 
+Point = tuple[float, float, float] | np.ndarray
+
 # (name, share of the cameras, distance from the axis, height, height looked at); lengths in radii of the subject, and
 # heights from its centre. At a radius of 0.55 m (a shirt over a range of motion) the cameras stand 1.5 m away, as in
 # the measured set-up; the low ring looks down at the legs and the upper one up at the head, as a lab's does.
@@ -22,8 +24,8 @@ RINGS: tuple[tuple[str, float, float, float, float], ...] = (
 )
 
 
-def look_at(eye: tuple[float, float, float] | np.ndarray, target: tuple[float, float, float] | np.ndarray) -> Float64[np.ndarray, "4 4"]:
-    """T_camera_world of a camera at `eye` with its z axis towards `target` and world Y up in the image (image y down)."""
+def look_at(eye: Point, target: Point) -> Float64[np.ndarray, "4 4"]:
+    """T_camera_world of a camera at `eye`, its z axis towards `target`, world Y up in its image."""
     eye, target = np.asarray(eye, float), np.asarray(target, float)
     forward = target - eye
     right = np.cross(forward, (0.0, 1.0, 0.0))
@@ -46,7 +48,7 @@ def bounding_sphere(points: np.ndarray) -> tuple[np.ndarray, float]:
 
 def capture_rig(
     *,
-    centre: tuple[float, float, float] | np.ndarray = (0.0, 1.2, 0.0),
+    centre: Point = (0.0, 1.2, 0.0),
     radius: float = 0.55,
     cameras: int = 48,
     image_size: int = 512,
@@ -70,7 +72,7 @@ def capture_rig(
         azimuths = 2 * np.pi * (np.arange(count) / max(count, 1) + 0.381966 * index)
         for number, azimuth in enumerate(azimuths):
             offset = np.array([distance * np.sin(azimuth), height, distance * np.cos(azimuth)])
-            transforms.append(look_at(centre + radius * offset, centre + (0.0, radius * aim, 0.0)))
+            transforms.append(look_at(centre + radius * offset, centre + radius * np.array([0.0, aim, 0.0])))
             names.append(f"{name}{number:02d}")
     focal = image_size / 2 / np.tan(np.radians(field_of_view_deg) / 2)
     middle = (image_size - 1) / 2

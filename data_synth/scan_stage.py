@@ -6,7 +6,7 @@ template vertex. Sequences whose faces change are scanned too, without truth.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 
@@ -42,7 +42,12 @@ from data_synth.scanner_config import ScanConfig
 __all__ = ["run"]
 
 SCHEMA = 1
-ROTATIONS = {"x": [[0, 1, 0], [1, 0, 0], [0, 0, -1]], "y": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "z": [[1, 0, 0], [0, 0, 1], [0, -1, 0]]}
+ROTATIONS = {
+    "x": [[0, 1, 0], [1, 0, 0], [0, 0, -1]],
+    "y": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    "z": [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
+}
+"""Turns the axis that points up into Y."""
 
 
 def run(

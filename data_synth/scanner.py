@@ -54,8 +54,9 @@ def scan_surfaces(
     scene = SurfaceScene(surfaces, ambient=config.shading.ambient, thickness_m=config.fusion.thickness_m)
     fields = draw_noise_fields(config.noise, rng, largest_image=int(rig.image_sizes.max()))
     areas = [float(face_areas(s.mesh.vertices, s.mesh.faces).sum()) for s in surfaces]
-    volumes = [DepthFusion(s.voxel_m, area, config=config.fusion) for s, area in zip(surfaces, areas, strict=True)]
-    insides = [DepthFusion(s.voxel_m, 0.1 * area, config=config.fusion) for s, area in zip(surfaces, areas, strict=True)]
+    sized = list(zip(surfaces, areas, strict=True))
+    volumes = [DepthFusion(surface.voxel_m, area, config=config.fusion) for surface, area in sized]
+    insides = [DepthFusion(surface.voxel_m, 0.1 * area, config=config.fusion) for surface, area in sized]
     sides = [(volumes, 1), (insides, -1)] if config.fusion.inside else [(volumes, 1)]
     for camera in range(len(rig.names)):
         images = scene.view(rig, camera)

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32, Int, Int32, UInt8
 
 from capture4d.mesh import vertex_normals
 from capture4d.open3d_loading import import_open3d
 from capture4d.types import Mesh
 
-__all__ = ["Direction", "Drawn", "View", "frame_view", "heat_colours", "render"]
+__all__ = ["Direction", "Drawn", "Traced", "View", "frame_view", "heat_colours", "render", "trace"]
 
 Direction = Literal["front", "back", "left", "right", "three_quarter", "three_quarter_back"]
 AZIMUTH_DEG: dict[Direction, float] = {
@@ -26,11 +26,37 @@ AZIMUTH_DEG: dict[Direction, float] = {
 }
 """Angle of the camera about the Y axis: 0 looks at the subject's face (from +Z), 90 at the subject's left (from +X)."""
 
-NO_DATA = (178, 178, 178)
+NO_DATA = (168, 172, 178)
+# Matplotlib's perceptually uniform "magma" (CC0), from its light end: good values are pale, so that the shading of the
+# folds stays visible.
+HEAT = np.array(
+    [
+        (252, 253, 191),
+        (253, 231, 169),
+        (254, 207, 146),
+        (254, 183, 126),
+        (254, 159, 109),
+        (252, 137, 97),
+        (247, 112, 92),
+        (237, 90, 95),
+        (222, 73, 104),
+        (202, 62, 114),
+        (183, 55, 121),
+        (161, 48, 126),
+        (140, 41, 129),
+        (120, 34, 129),
+        (100, 26, 128),
+        (81, 18, 124),
+        (59, 15, 112),
+        (37, 18, 85),
+    ]
+)
 # Key, fill and rim light in the camera's axes (x right, y up, z towards the viewer), and their strengths.
 LIGHTS = np.array([[-0.45, 0.65, 0.62], [0.75, 0.05, 0.66], [0.0, -0.35, 0.25]])
-STRENGTHS = np.array([0.72, 0.22, 0.10])
-AMBIENT = 0.16
+STRENGTHS = np.array([0.80, 0.26, 0.10])
+AMBIENT = 0.20
+SUPERSAMPLING = 2
+"""Samples along each side of a pixel."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,19 +118,14 @@ def frame_view(
     return View(view.target, view.azimuth_deg, elevation_deg, float(height), distance)
 
 
-def heat_colours(
-    values: Float[np.ndarray, " verts"], *, low: float = 0.0, high: float, colormap: str = "viridis"
-) -> UInt8[np.ndarray, "verts 3"]:
-    """Colours of scalars between `low` and `high`, which saturate; NaN, no data, is grey."""
-    import matplotlib
-
-    share = (np.asarray(values, float) - low) / (high - low)
-    table = (matplotlib.colormaps[colormap](np.linspace(0, 1, 256))[:, :3] * 255 + 0.5).astype(np.uint8)
+def heat_colours(values: Float[np.ndarray, " verts"], *, low: float = 0.0, high: float) -> UInt8[np.ndarray, "verts 3"]:
+    """Colours of scalars: pale at `low`, through orange to dark violet at `high` and above; NaN, no data, is grey."""
+    share = np.clip((np.asarray(values, float) - low) / (high - low), 0, 1)
     missing = np.isnan(share)
-    index = np.clip(np.where(missing, 0, share) * 255 + 0.5, 0, 255).astype(np.uint8)
-    colours = table[index]
+    position = np.where(missing, 0, share) * (len(HEAT) - 1)
+    colours = np.stack([np.interp(position, np.arange(len(HEAT)), channel) for channel in HEAT.T], axis=-1)
     colours[missing] = NO_DATA
-    return colours
+    return (colours + 0.5).astype(np.uint8)
 
 
 def render(
@@ -114,35 +135,73 @@ def render(
     width: int = 480,
     height: int = 640,
     background: tuple[int, int, int] = (255, 255, 255),
-    supersampling: int = 2,
 ) -> UInt8[np.ndarray, "height width 3"]:
     """A picture of meshes, row 0 on top."""
+    traced = trace([item.mesh for item in drawn], view, width=width, height=height)
+    return traced.painted([item.colours for item in drawn], background=background)
+
+
+def trace(meshes: Sequence[Mesh], view: View, *, width: int, height: int) -> Traced:
+    """Find what every pixel sees, to be painted once or several times."""
     o3d = import_open3d()
     scene = o3d.t.geometry.RaycastingScene()
-    colours, normals, faces, counts = [], [], [], [0]
-    for item in drawn:
-        mesh = item.mesh
-        if not len(mesh.faces):
-            continue
-        scene.add_triangles(o3d.core.Tensor(mesh.vertices), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
-        colours.append(np.broadcast_to(_linear(np.asarray(item.colours, np.uint8)), mesh.vertices.shape))
+    normals, faces, first_vertex, first_face = [np.zeros((0, 3))], [np.zeros((0, 3), np.int32)], 0, [0]
+    for mesh in meshes:
         normals.append(vertex_normals(mesh.vertices, mesh.faces))
-        faces.append(mesh.faces + sum(len(each) for each in colours[:-1]))
-        counts.append(counts[-1] + len(mesh.faces))
-    samples = (height * supersampling, width * supersampling)
-    backdrop = _linear(np.array(background, np.uint8))
-    picture = np.tile(backdrop, (samples[0] * samples[1], 1))
-    if faces:
-        rays = _rays(view, *samples)
-        answer = scene.cast_rays(o3d.core.Tensor(rays))
-        hit = np.flatnonzero(np.isfinite(answer["t_hit"].numpy()))
-        face = answer["primitive_ids"].numpy()[hit] + np.array(counts)[answer["geometry_ids"].numpy()[hit]]
-        corners, weights = np.concatenate(faces)[face], _barycentric(answer["primitive_uvs"].numpy()[hit])
-        colour = np.einsum("nk,nkc->nc", weights, np.concatenate(colours)[corners])
-        normal = np.einsum("nk,nkc->nc", weights, np.concatenate(normals)[corners])
-        picture[hit] = colour * _shade(normal, rays[hit, 3:], view)[:, None]
-    picture = picture.reshape(height, supersampling, width, supersampling, 3).mean(axis=(1, 3))
-    return _encoded(picture)
+        faces.append(mesh.faces + np.int32(first_vertex))
+        first_vertex += len(mesh.vertices)
+        if len(mesh.faces):
+            scene.add_triangles(o3d.core.Tensor(mesh.vertices), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
+            first_face.append(first_face[-1] + len(mesh.faces))
+    counts = tuple(len(mesh.vertices) for mesh in meshes)
+    if len(first_face) == 1:
+        none = np.zeros((0, 3), np.float32)
+        return Traced((height, width), counts, np.zeros(0, int), none.astype(np.int32), none, none[:, 0])
+    rays = _rays(view, height * SUPERSAMPLING, width * SUPERSAMPLING)
+    answer = scene.cast_rays(o3d.core.Tensor(rays))
+    hit = np.flatnonzero(np.isfinite(answer["t_hit"].numpy()))
+    face = answer["primitive_ids"].numpy()[hit] + np.array(first_face)[answer["geometry_ids"].numpy()[hit]]
+    corners = np.concatenate(faces)[face]
+    second_third = answer["primitive_uvs"].numpy()[hit]
+    weights = np.column_stack([1 - second_third.sum(axis=1), second_third])
+    normal = np.einsum("nk,nkc->nc", weights, np.concatenate(normals)[corners])
+    light = _shade(normal, rays[hit, 3:], view).astype(np.float32)
+    return Traced((height, width), counts, hit, corners, weights, light)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Traced:
+    """What the samples of a picture see, and how bright it is."""
+
+    size: tuple[int, int]
+    """Height and width of the picture."""
+    counts: tuple[int, ...]
+    """Vertices of each mesh."""
+    hit: Int[np.ndarray, " hits"]
+    """Samples that see a mesh, row by row."""
+    corners: Int32[np.ndarray, "hits 3"]
+    """Vertices of the face they see, all meshes counted through."""
+    weights: Float32[np.ndarray, "hits 3"]
+    light: Float32[np.ndarray, " hits"]
+
+    def painted(
+        self,
+        colours: Sequence[UInt8[np.ndarray, "_ 3"] | tuple[int, int, int]],
+        *,
+        background: tuple[int, int, int] = (255, 255, 255),
+    ) -> UInt8[np.ndarray, "height width 3"]:
+        """The picture with these colours, one for each mesh or for each of its vertices."""
+        height, width = self.size
+        picture = np.tile(_linear(np.array(background, np.uint8)), (height * width * SUPERSAMPLING**2, 1))
+        table = [
+            np.broadcast_to(_linear(np.asarray(each, np.uint8)), (count, 3))
+            for each, count in zip(colours, self.counts, strict=True)
+        ]
+        if len(self.hit):
+            colour = np.einsum("nk,nkc->nc", self.weights, np.concatenate(table)[self.corners])
+            picture[self.hit] = colour * self.light[:, None]
+        samples = picture.reshape(height, SUPERSAMPLING, width, SUPERSAMPLING, 3)
+        return _encoded(samples.mean(axis=(1, 3)))
 
 
 def _rays(view: View, rows: int, columns: int) -> Float32[np.ndarray, "rays 6"]:
@@ -169,10 +228,6 @@ def _shade(normals: np.ndarray, directions: np.ndarray, view: View) -> np.ndarra
     lights = LIGHTS / np.linalg.norm(LIGHTS, axis=1, keepdims=True) @ view.axes()
     light = AMBIENT + np.clip(normals @ lights.T, 0, None) @ STRENGTHS
     return np.where(facing < 0, 0.6, 1.0) * light
-
-
-def _barycentric(uv: np.ndarray) -> np.ndarray:
-    return np.column_stack([1 - uv.sum(axis=1), uv])
 
 
 def _linear(srgb: np.ndarray) -> np.ndarray:

@@ -76,7 +76,8 @@ def test_border_errors_compare_loops_of_one_name_both_ways():
         angle = np.linspace(0, 2 * np.pi, count, endpoint=False)
         return np.column_stack([radius * np.cos(angle), 0 * angle, radius * np.sin(angle)])
 
-    errors = border_errors({"neck": circle(1.0, 400), "cuff": circle(5, 10)}, {"neck": circle(1.1, 300), "hem": circle(9, 9)})
+    found = {"neck": circle(1.0, 400), "cuff": circle(5, 10)}
+    errors = border_errors(found, {"neck": circle(1.1, 300), "hem": circle(9, 9)})
     assert len(errors) == 700
     np.testing.assert_allclose(errors, 0.1, atol=1e-3)
     assert len(border_errors({}, {"neck": circle(1.0, 10)})) == 0

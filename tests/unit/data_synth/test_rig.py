@@ -20,7 +20,9 @@ def test_every_camera_looks_at_the_subject_the_right_way_up(cameras):
         rotation = rig.T_camera_world[camera, :3, :3]
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
         assert np.linalg.det(rotation) == pytest.approx(1)
-        (middle, above, beside), depth = project(rig, camera, centre + [[0, 0, 0], [0, 0.1, 0], -0.1 * rotation[0]])
+        (middle, above, beside), depth = project(
+            rig, camera, centre + np.stack([np.zeros(3), [0, 0.1, 0], -0.1 * rotation[0]])
+        )
         assert (depth > 0).all()
         assert (np.abs(middle - 127.5) < 128).all()
         assert above[1] < middle[1]  # up in the world is up in the image

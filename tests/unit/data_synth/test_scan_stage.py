@@ -168,8 +168,12 @@ def test_cloth_that_hangs_close_to_a_border_stays_unpainted():
     """Two skirts, one inside the other: the closed-off inner one is near the outer's border in space only."""
     outer = skirt()
     middle = Mesh((outer.vertices * [0.9, 0.5, 0.9] + [0, 0.3, 0]).astype(np.float32), outer.faces)
-    both = Mesh(np.concatenate([outer.vertices, middle.vertices]), np.concatenate([outer.faces, middle.faces + np.int32(len(outer.vertices))]))
-    sheet = paint_borders(both, width_m=0.4, garment_colour=BLUE, border_colours=[YELLOW, YELLOW, BLUE, BLUE], max_edge_m=0.1)
+    both = Mesh(
+        np.concatenate([outer.vertices, middle.vertices]),
+        np.concatenate([outer.faces, middle.faces + np.int32(len(outer.vertices))]),
+    )
+    colours = [YELLOW, YELLOW, BLUE, BLUE]
+    sheet = paint_borders(both, width_m=0.4, garment_colour=BLUE, border_colours=colours, max_edge_m=0.1)
     refined = sheet.posed(both.vertices)
     painted = (sheet.colours == YELLOW).all(axis=1)
     radius = np.hypot(refined.vertices[:, 0], refined.vertices[:, 2])

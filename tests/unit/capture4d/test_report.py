@@ -1,0 +1,167 @@
+import json
+import re
+import xml.etree.ElementTree as ElementTree
+
+import numpy as np
+import pytest
+
+from capture4d.app.charts import Line, line_chart, nice_ticks
+from capture4d.app.report import ReportConfig, run
+from capture4d.app.report_metrics import summarise
+from capture4d.errors import InputError
+from capture4d.mesh import boundary_loops
+from capture4d.scans import (
+    Capture,
+    TruthFrame,
+    TruthModel,
+    save_garment,
+    write_capture_description,
+    write_scan,
+    write_truth_frame,
+    write_truth_model,
+)
+from capture4d.types import Garment, Mesh, Scan
+from capture4d.workdir import open_stage, write_bytes, write_json, write_npy, write_npz
+
+FRAMES = 8
+
+
+def tube(rows=12, around=20):
+    angle = 2 * np.pi * np.arange(around) / around
+    height = np.linspace(0, 0.6, rows)[:, None] + 0 * angle
+    vertices = np.stack([0.2 * np.sin(angle) + 0 * height, height, 0.2 * np.cos(angle) + 0 * height], axis=2)
+    i, j = np.meshgrid(np.arange(rows - 1), np.arange(around), indexing="ij")
+    a, b = (i * around + j).ravel(), (i * around + (j + 1) % around).ravel()
+    faces = np.concatenate([np.stack([a, b, b + around], 1), np.stack([a, b + around, a + around], 1)])
+    return Mesh(vertices.reshape(-1, 3).astype(np.float32), faces.astype(np.int32))
+
+
+def record(index, **changes):
+    return {
+        "frame_id": index, "verdict": "good", "reasons": [], "fit_mean_mm": 0.5, "fit_p95_mm": 1.0,
+        "boundary_mean_mm": None, "stretch_p99": 1.1, "cpu_s": 0.2 + 0.1 * (index == 0), **changes,
+    }  # fmt: skip
+
+
+@pytest.fixture
+def work(tmp_path):
+    """A finished registration that lies a growing distance above the truth, whose scan is the truth."""
+    mesh = tube()
+    loops = {f"border_{i}": loop for i, loop in enumerate(boundary_loops(mesh.faces))}
+    capture = Capture(tmp_path / "capture", "tube", 60.0, tuple(range(FRAMES)), (47, 98, 201), {})
+    write_capture_description(capture)
+    first = mesh.faces[:, 0]
+    owner = np.array([np.flatnonzero((mesh.faces == v).any(axis=1))[0] for v in range(len(mesh.vertices))], np.int32)
+    barycentric = (mesh.faces[owner] == np.arange(len(mesh.vertices))[:, None]).astype(np.float32)
+    write_truth_model(tmp_path / "capture" / "truth" / "model.npz", TruthModel(mesh, loops, owner, barycentric))
+    stage = open_stage(tmp_path / "registration", name="register", schema=1, config=ReportConfig(), upstream={})
+    vertices, lines = [], []
+    for index in range(FRAMES):
+        truth = mesh.vertices + np.float32(0.1 * index)
+        name = f"{index:06d}"
+        labels = np.ones(len(truth), np.uint8)
+        none = np.zeros((0, 3, 3), np.float32), np.zeros(3, np.float32)
+        write_truth_frame(tmp_path / "capture" / "truth" / f"{name}.npz", TruthFrame(truth, *none, labels))
+        colours = np.full((len(truth), 3), 90, np.uint8)
+        write_scan(tmp_path / "capture" / "scans" / f"{name}.ply", Scan(Mesh(truth, mesh.faces), colours, index, 0.0))
+        vertices.append(truth + np.array([0, 0.001 * (1 + index), 0], np.float32))
+        residual = np.full(len(truth), 0.0005, np.float32)
+        residual[first[:3]] = np.nan
+        write_npz(stage.frame_path(index), vertices=vertices[-1], residual_m=residual, verdict=np.uint8(0))
+        lines.append(json.dumps(record(index)))
+    lines[5] = json.dumps(record(5, verdict="failed", reasons=["a <reason> to escape"], fit_p95_mm=9.0))
+    save_garment(tmp_path / "registration" / "garment.npz", Garment(mesh, loops))
+    write_npy(tmp_path / "registration" / "vertices.npy", np.stack(vertices))
+    write_bytes(tmp_path / "registration" / "metrics.jsonl", "\n".join(lines).encode())
+    stage.finish([tmp_path / "registration" / "vertices.npy"])
+    return tmp_path
+
+
+def metrics_of(work):
+    metrics = json.loads((work / "report" / "metrics.json").read_text())["metrics"]
+    return {entry["key"]: entry["value"] for entry in metrics}
+
+
+def test_metrics_follow_their_definitions(work):
+    run(work, config=ReportConfig(pictures=1))
+    metrics = metrics_of(work)
+    assert metrics["correspondence_mean_mm"] == pytest.approx(np.mean(1 + np.arange(FRAMES)), rel=1e-4)
+    assert metrics["drift_mm_per_frame"] == pytest.approx(1, rel=1e-4)
+    assert metrics["drift_ratio"] == pytest.approx((5 + 6 + 7 + 8) / (1 + 2 + 3 + 4), rel=1e-4)
+    assert metrics["border_mean_mm"] == pytest.approx(metrics["correspondence_mean_mm"], rel=1e-4)
+    assert metrics["truth_distance_mean_mm"] < 0.2 * metrics["correspondence_mean_mm"]  # it slid along the surface
+    assert metrics["fit_p95_mm"] == pytest.approx((7 * 1 + 9) / 8)
+    assert metrics["frames_good_percent"] == pytest.approx(100 * 7 / 8)
+    assert metrics["frames_failed"] == 1
+    assert metrics["cpu_s"] == pytest.approx(0.2)
+    assert metrics["boundary_mean_mm"] is None
+
+
+def test_the_page_stands_alone_and_shows_what_it_should(work):
+    page = run(work).read_text()
+    assert not re.search(r'(src|href)="(?!data:)', page)
+    assert page.count("data:image/webp") >= 6 * 2 * 4
+    assert "a &lt;reason&gt; to escape" in page
+    assert "Frame 5" in page  # the failed frame, drawn on top of the six
+    for chart in re.findall(r"<svg.*?</svg>", page, re.DOTALL):
+        ElementTree.fromstring(chart)
+    assert (work / "report" / "index.html").stat().st_size < 2e6
+
+
+def test_a_report_is_made_once(work):
+    run(work, config=ReportConfig(pictures=1))
+    before = (work / "report" / "index.html").stat().st_mtime_ns
+    run(work, config=ReportConfig(pictures=1))
+    assert (work / "report" / "index.html").stat().st_mtime_ns == before
+    run(work, config=ReportConfig(pictures=2))
+    assert (work / "report" / "index.html").stat().st_mtime_ns != before
+
+
+def test_truth_on_every_nth_frame_keeps_the_slope(work):
+    run(work, config=ReportConfig(pictures=1, truth_frames=3))
+    assert metrics_of(work)["drift_mm_per_frame"] == pytest.approx(1, rel=0.1)
+
+
+def test_a_capture_that_has_moved_is_named(work):
+    (work / "capture").rename(work / "elsewhere")
+    with pytest.raises(InputError, match="capture"):
+        run(work)
+    run(work, capture=work / "elsewhere", config=ReportConfig(pictures=1, truth_frames=1))
+
+
+def test_an_unfinished_registration_names_the_repair(tmp_path, work):
+    stage = json.loads((work / "registration" / "stage.json").read_text())
+    write_json(work / "registration" / "stage.json", {**stage, "status": "running"})
+    with pytest.raises(InputError, match="capture4d register"):
+        run(work)
+
+
+def test_a_take_without_truth_has_no_truth_metrics(work):
+    (work / "capture" / "truth" / "model.npz").unlink()
+    run(work, config=ReportConfig(pictures=1))
+    metrics = metrics_of(work)
+    assert "correspondence_mean_mm" not in metrics
+    assert "fit_mean_mm" in metrics
+
+
+def test_numbers_nobody_measured_are_null_not_nan():
+    summary = summarise([record(0), record(1)])
+    assert summary["boundary_mean_mm"] is None
+    assert "border_mean_mm" not in summary
+
+
+@pytest.mark.parametrize(("low", "high"), [(0, 1), (0, 0.037), (-3, 12), (1, 1.3), (0, 9999)])
+def test_ticks_are_round_and_enclose_the_values(low, high):
+    ticks = nice_ticks(low, high)
+    assert ticks[0] <= low < high <= ticks[-1]
+    assert 3 <= len(ticks) <= 8
+    steps = np.diff(ticks)
+    np.testing.assert_allclose(steps, steps[0], rtol=1e-6)
+
+
+def test_gaps_interrupt_a_curve():
+    values = np.array([1.0, 2.0, np.nan, 3.0, np.nan, 4.0, 5.0])
+    chart = line_chart(range(7), [Line("x", values, "#000")])
+    curve = re.search(r'class="curve" d="([^"]*)"', chart).group(1)
+    assert curve.count("M") == 3
+    assert curve.count("h.1") == 1
