@@ -23,7 +23,7 @@ from capture4d.errors import InputError
 from data_synth import config as synth_config
 from data_synth.scanner_config import ScanConfig
 from registration import config as registration_config
-from registration.config import RegistrationConfig
+from registration.config import MeshRegistrationConfig, RegistrationConfig
 
 # What a user's disk can answer; the message names the path, and a traceback would add nothing.
 _DISK_ANSWERS = {
@@ -154,6 +154,26 @@ class Register(_Stage):
 
 
 @dataclass(frozen=True, kw_only=True)
+class RegisterMesh:
+    """Register any template to any scan, two mesh files; writes the result, and its measures as JSON beside it."""
+
+    template: Annotated[Positional[Path], arg(metavar="TEMPLATE")]
+    """Mesh to deform: obj, ply or glb. Its vertex order and faces are kept."""
+    scan: Annotated[Positional[Path], arg(metavar="SCAN")]
+    """Mesh to fit it to: obj, ply or glb."""
+    output: Path
+    """Mesh to write: ply, obj or glb; the JSON has the same name."""
+    config: Annotated[MeshRegistrationConfig, arg(name="")] = field(default_factory=MeshRegistrationConfig)
+
+    def __call__(self) -> int:
+        from registration.register_mesh import run
+
+        run(self.template, self.scan, self.output, self.config)
+        print(f"registered: {self.output}, measures: {self.output.with_suffix('.json')}")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
 class Run(_Stage):
     """Run every stage on a capture: extract, register, report."""
 
@@ -221,6 +241,7 @@ _COMMANDS: Mapping[str, Any] = {
     "register": Register,
     "run": Run,
     "report": Report,
+    "register-mesh": RegisterMesh,
     "convert-body": ConvertBody,
 }
 

@@ -277,6 +277,27 @@ def test_run_does_every_stage_and_a_second_run_nothing(
     assert "no metric 'beauty'" in fails(capsys, "report", work, "--fail-above", "beauty=1")
 
 
+def test_register_mesh_keeps_the_templates_faces_and_measures(
+    tube_capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    template, scan = tmp_path / "template.obj", tube_capture / "scans" / "000007.ply"
+    mesh = load_garment(tube_capture / "template.npz").template
+    write_mesh(template, mesh)
+    assert run("register-mesh", template, scan, "--output", tmp_path / "out.ply", "--boundary-colour", "ffd200") == 0
+    np.testing.assert_array_equal(read_mesh(tmp_path / "out.ply").mesh.faces, mesh.faces)
+    measures = json.loads((tmp_path / "out.json").read_text())
+    assert measures["fit_mean_mm"] < 1
+    assert measures["boundary_mean_mm"] < 5
+    assert measures["cpu_s"] > 0
+
+    uncoloured = tmp_path / "uncoloured.ply"
+    write_mesh(uncoloured, read_mesh(scan).mesh)
+    command = ("register-mesh", template, uncoloured, "--output", tmp_path / "2.ply", "--boundary-colour", "ffd200")
+    assert "uncoloured.ply: expected a colour per vertex" in fails(capsys, *command)
+    assert "no such mesh file" in fails(capsys, "register-mesh", template, "no.ply", "--output", tmp_path / "2.ply")
+    assert not (tmp_path / "2.ply").exists()
+
+
 # --- the gate
 
 
