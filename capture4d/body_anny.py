@@ -46,7 +46,7 @@ def _bake(scratch: Path) -> Body:
     import torch
     import warp
 
-    warp.config.log_level = warp.LOG_WARNING  # before anny loads: warp announces devices and every compiled module
+    warp.config.log_level = warp.LOG_ERROR  # before anny loads: warp announces devices and compiled modules
     import anny
 
     anny.paths.set_anny_cache_path(scratch)

@@ -253,7 +253,8 @@ def mesh_pattern(pattern: Pattern, vertex_count: int, rng: np.random.Generator) 
         offset += len(panel_points)
     plane, corners = np.concatenate(points), np.concatenate(faces)
 
-    pairs = np.concatenate([np.stack(sides, axis=1) for sides in edge_vertices.values() if len(sides) == 2])
+    sewn = [np.stack(sides, axis=1) for sides in edge_vertices.values() if len(sides) == 2]
+    pairs = np.concatenate([np.zeros((0, 2), int), *sewn])
     graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(offset, offset))
     _, welded = connected_components(graph, directed=False)
     _, first, welded = np.unique(welded, return_index=True, return_inverse=True)

@@ -142,7 +142,7 @@ def simulate(
     """
     import warp
 
-    warp.config.log_level = warp.LOG_WARNING  # before newton loads: it announces devices and every compiled module
+    warp.config.log_level = warp.LOG_ERROR  # before newton loads: it announces devices and compiled modules
     import newton
 
     model, body = _build_model(mesh, start, bodies, fabric)

@@ -16,8 +16,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
+from numba import njit
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from capture4d.mesh import unique_edges, vertex_adjacency, vertex_normals
@@ -245,7 +245,7 @@ def _material_frames(mesh: WrinkleMesh, base: np.ndarray, normals: np.ndarray) -
     return np.stack([along, np.cross(normals, along), normals], axis=1)
 
 
-@numba.njit(cache=True, fastmath=True, boundscheck=False)
+@njit(cache=True, fastmath=True, nogil=True)
 def _relax(
     x, base, normals, edges, lengths, hinges, weights, bend, pull_n, pull_t, radius, planes, plane_normals, margin, sweeps
 ):

@@ -47,7 +47,7 @@ def _tube_faces(offset: int) -> np.ndarray:
         for r in range(5)
         for k in range(16)
         for a, b, c, d in [(r * 16 + k, r * 16 + (k + 1) % 16, (r + 1) * 16 + k, (r + 1) * 16 + (k + 1) % 16)]
-        for face in ((a, c, b), (b, c, d))
+        for face in ((a, b, c), (b, d, c))
     ]
     return np.array(rows) + offset
 

@@ -1,0 +1,125 @@
+"""Fine folds: the stencils are those of the pattern, and relaxation does what each of its parts promises."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data_synth.cloth_quality import measure_cloth
+from data_synth.config import Fabric, RelaxationConfig
+from data_synth.patterns import Edge, Panel, PanelMesh, Pattern, mesh_pattern
+from data_synth.wrinkle_relaxation import WrinkleMesh, lift, relax_frame, wrinkle_mesh
+
+SIDE = 0.3
+FAR_BODY = np.array([[-9.0, -9.0, -9.0], [9.0, -9.0, -9.0], [0.0, 9.0, -9.0]])
+BODY_FACES = np.array([[0, 1, 2]], np.int32)
+
+
+def square(vertices: int, seed: int) -> PanelMesh:
+    corners = np.array([[0, 0], [SIDE, 0], [SIDE, SIDE], [0, SIDE], [0, 0]], float)
+    edges = tuple(Edge(np.linspace(a, b, 20), "rim|sheet") for a, b in zip(corners, corners[1:], strict=False))
+    return mesh_pattern(Pattern((Panel("sheet", edges),), ("rim",)), vertices, np.random.default_rng(seed))
+
+
+@pytest.fixture(scope="module")
+def sheets() -> tuple[PanelMesh, PanelMesh, WrinkleMesh]:
+    coarse, fine = square(150, 0), square(4000, 1)
+    return coarse, fine, wrinkle_mesh(coarse, fine, RelaxationConfig(), np.random.default_rng(2))
+
+
+def flat(mesh: PanelMesh, width: float = 1.0) -> np.ndarray:
+    return np.column_stack([mesh.vertex_uv * [width, 1], np.zeros(mesh.vertex_count)])
+
+
+def test_rest_lengths_are_those_of_the_pattern(sheets) -> None:
+    _, fine, wrinkles = sheets
+    ends = fine.vertex_uv[wrinkles.edges]
+    np.testing.assert_allclose(wrinkles.rest_lengths, np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1), rtol=1e-6)
+
+
+def test_bending_stencils_vanish_on_flat_cloth_and_see_a_fold(sheets) -> None:
+    _, fine, wrinkles = sheets
+
+    def bent(height: np.ndarray) -> np.ndarray:
+        points = np.column_stack([fine.vertex_uv, height])
+        return np.einsum("qk,qkc->qc", wrinkles.hinge_weights[:, :4], points[wrinkles.hinges])
+
+    assert np.abs(bent(0.3 * fine.vertex_uv[:, 0] - fine.vertex_uv[:, 1])).max() < 1e-4 * SIDE
+    fold = bent(np.abs(fine.vertex_uv[:, 0] - SIDE / 2))
+    crossing = np.ptp(np.sign(fine.vertex_uv[wrinkles.hinges[:, 2:], 0] - SIDE / 2), axis=1) > 0
+    assert np.abs(fold[crossing, 2]).mean() > 50 * np.abs(fold[~crossing, 2]).mean()
+
+
+def test_a_plane_is_lifted_to_itself(sheets) -> None:
+    coarse, fine, wrinkles = sheets
+    lifted, normals = lift(wrinkles, flat(coarse))
+    np.testing.assert_allclose(lifted, flat(fine), atol=1e-9)
+    np.testing.assert_allclose(normals, np.broadcast_to([0, 0, 1.0], normals.shape), atol=1e-9)
+
+
+def test_compressed_cloth_folds_until_its_edges_have_their_length(sheets) -> None:
+    coarse, fine, wrinkles = sheets
+    settings = RelaxationConfig(sweeps=60)
+    folded, _ = relax_frame(wrinkles, flat(coarse, 0.93), FAR_BODY, BODY_FACES, None, Fabric(), settings)
+    ends = folded[wrinkles.edges]
+    stretch = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / wrinkles.rest_lengths
+    assert np.percentile(stretch, 5) > 0.97, "7 % of the width should have gone into folds"
+    assert np.percentile(stretch, 99) < 1.06
+    assert np.abs(folded[:, 2]).max() > 0.002
+    assert np.abs(folded - flat(fine, 0.93)).max() < 1.5 * settings.radius_m
+
+
+def test_stiffer_cloth_has_fewer_folds(sheets) -> None:
+    coarse, _, wrinkles = sheets
+    roughness = []
+    for bending in (0.05, 0.6):
+        fabric = replace(Fabric(), fold_bending=bending)
+        folded, _ = relax_frame(wrinkles, flat(coarse, 0.93), FAR_BODY, BODY_FACES, None, fabric, RelaxationConfig())
+        bent = np.einsum("qk,qkc->qc", wrinkles.hinge_weights[:, :4], folded[wrinkles.hinges])
+        roughness.append(float(np.abs(bent).mean()))
+    assert roughness[1] < 0.7 * roughness[0]
+
+
+def test_cloth_stays_outside_the_body(sheets) -> None:
+    coarse, _, wrinkles = sheets
+    body = np.array([[-9.0, -9.0, 0.001], [9.0, -9.0, 0.001], [0.0, 9.0, 0.001]])  # 1 mm into the sheet
+    folded, _ = relax_frame(wrinkles, flat(coarse, 0.93), body, BODY_FACES, None, Fabric(), RelaxationConfig())
+    assert folded[:, 2].min() > 0.001
+
+
+def test_folds_of_two_starts_meet(sheets) -> None:
+    """The folds follow the pose: runs that start apart agree after a while; with no imperfection they need not."""
+    coarse, _, wrinkles = sheets
+    frames = [flat(coarse, width) for width in np.linspace(0.99, 0.93, 40)]
+    ends = []
+    for start in (0, 15):
+        offsets = None
+        for frame in frames[start:]:
+            folded, offsets = relax_frame(
+                wrinkles, frame, FAR_BODY, BODY_FACES, offsets, Fabric(), RelaxationConfig()
+            )
+        ends.append(folded)
+    assert np.abs(ends[0] - ends[1])[:, 2].mean() < 0.25 * np.abs(ends[0][:, 2]).mean()
+
+
+def test_equal_input_gives_equal_bits(sheets) -> None:
+    coarse, _, wrinkles = sheets
+    first, second = (
+        relax_frame(wrinkles, flat(coarse, 0.95), FAR_BODY, BODY_FACES, None, Fabric(), RelaxationConfig())[0]
+        for _ in range(2)
+    )
+    np.testing.assert_array_equal(first, second)
+
+
+@pytest.mark.parametrize(("scale", "crushed", "over"), [(0.249, 1, 0), (0.251, 0, 0), (1.99, 0, 0), (2.01, 0, 1)])
+def test_area_limits_are_those_of_the_paper(sheets, scale: float, crushed: int, over: int) -> None:
+    _, fine, wrinkles = sheets
+    quality = measure_cloth(
+        fine, wrinkles, flat(fine, scale).astype(np.float32), FAR_BODY.astype(np.float32), BODY_FACES
+    )
+    faces = len(fine.faces)
+    assert quality.crushed_faces == crushed * faces
+    assert quality.overstretched_faces == over * faces
+    assert bool(quality.reasons) == (bool(crushed or over) or quality.stretch_p99 > 1.2)
