@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32, Integer
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from capture4d.mesh import face_areas, vertex_normals
 from capture4d.open3d_loading import import_open3d
@@ -152,7 +152,7 @@ def scan_errors(scan: Mesh, truth: Mesh, *, hole_gate_m: float = 0.004, samples:
     chosen = rng.choice(len(areas), samples, p=areas / areas.sum())
     weights = rng.dirichlet((1, 1, 1), samples)
     on_truth = np.einsum("vc,vcx->vx", weights, truth.vertices[truth.faces[chosen]])
-    nearest, _ = cKDTree(scan.vertices).query(on_truth)
+    nearest, _ = KDTree(scan.vertices).query(on_truth)
     return ScanErrors(
         distance_m=np.linalg.norm(points.astype(float) - scan.vertices, axis=1),
         normal_deg=np.degrees(np.arccos(np.clip(np.abs(cosine.astype(float)), 0, 1))),

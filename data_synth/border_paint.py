@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32, Int32, UInt8
 from scipy import sparse
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from capture4d.mesh import boundary_loops, unique_edges
 from capture4d.types import Mesh
@@ -46,7 +46,7 @@ def paint_borders(
     width of 0 or no colours leave the mesh as it is.
     """
     loops = tuple(boundary_loops(mesh.faces))
-    refine = sparse.eye_array(len(mesh.vertices), format="csr", dtype=np.float32)
+    refine = sparse.eye_array(len(mesh.vertices), format="csr").astype(np.float32)
     faces, vertices = mesh.faces, mesh.vertices.astype(float)
     painted = width_m > 0 and bool(border_colours) and bool(loops)
     while painted:
@@ -75,7 +75,7 @@ def _distance_to_loops(
     for loop in loops:
         start, end = mesh.vertices[loop].astype(float), mesh.vertices[np.roll(loop, -1)].astype(float)
         share = np.arange(16)[:, None, None] / 16
-        columns.append(cKDTree((start + share * (end - start)).reshape(-1, 3)).query(vertices)[0])
+        columns.append(KDTree((start + share * (end - start)).reshape(-1, 3)).query(vertices)[0])
         columns[-1][loop] = 0.0
     return np.column_stack(columns)
 

@@ -13,14 +13,14 @@ __all__ = ["bounding_sphere", "capture_rig", "look_at"]
 Point = tuple[float, float, float] | np.ndarray
 
 # (name, share of the cameras, distance from the axis, height, height looked at); lengths in radii of the subject, and
-# heights from its centre. At a radius of 0.55 m (a shirt over a range of motion) the cameras stand 1.5 m away, as in
-# the measured set-up; the low ring looks down at the legs and the upper one up at the head, as a lab's does.
+# heights from its centre. The middle ring just sees the whole sphere. At a radius of 0.6 m (a shirt over a range of
+# motion) cameras stand 1.5 m away; the low ring looks down at the legs and the upper one up at the head, as a lab's does.
 RINGS: tuple[tuple[str, float, float, float, float], ...] = (
-    ("low", 0.25, 2.75, -1.45, -0.35),
-    ("middle", 0.35, 2.75, 0.0, 0.0),
-    ("upper", 0.25, 2.60, 1.45, 0.20),
-    ("top", 0.10, 1.70, 2.50, 0.0),
-    ("floor", 0.05, 2.20, -1.70, 0.0),
+    ("low", 0.25, 2.47, -1.30, -0.30),
+    ("middle", 0.35, 2.47, 0.0, 0.0),
+    ("upper", 0.25, 2.33, 1.30, 0.18),
+    ("top", 0.10, 1.55, 2.25, 0.0),
+    ("floor", 0.05, 2.00, -1.50, 0.0),
 )
 
 

@@ -11,7 +11,7 @@ from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from capture4d.errors import InputError
 from capture4d.evaluation import closest_points
@@ -206,7 +206,7 @@ def _own_vertices(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
 
 def _matched_loops(mesh: Mesh, first: Mesh, names: tuple[str, ...]) -> dict[str, np.ndarray]:
     """The template's border loops under the names of the sequence's loops nearest to them."""
-    trees = [cKDTree(first.vertices[loop]) for loop in boundary_loops(first.faces)]
+    trees = [KDTree(first.vertices[loop]) for loop in boundary_loops(first.faces)]
     loops = {}
     for loop in boundary_loops(mesh.faces):
         distances = [tree.query(mesh.vertices[loop])[0].mean() for tree in trees]

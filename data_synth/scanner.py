@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import UInt8
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from capture4d.errors import InputError
 from capture4d.mesh import face_areas
@@ -98,5 +98,5 @@ def _labels(surface: Surface, points: np.ndarray) -> UInt8[np.ndarray, " points"
     painted = code != np.bincount(code).argmax()
     if not painted.any() or not len(points):
         return np.full(len(points), LABEL_GARMENT, np.uint8)
-    _, nearest = cKDTree(surface.mesh.vertices).query(points, workers=1)
+    _, nearest = KDTree(surface.mesh.vertices).query(points, workers=1)
     return np.where(painted[nearest], LABEL_BORDER, LABEL_GARMENT).astype(np.uint8)

@@ -66,8 +66,8 @@ class ShadingConfig:
 class FusionConfig:
     """Fusion of the depth images by truncated signed distances, and the cleaning of the result."""
 
-    garment_voxel_m: float = 0.003
-    body_voxel_m: float = 0.0045
+    garment_voxel_m: float = 0.0027
+    body_voxel_m: float = 0.005
     truncation_voxels: float = 3.0
     """Open3D's default of 8 lets both sides of a sleeve interfere: four times the error."""
     min_weight: float = 2.0

@@ -162,8 +162,8 @@ def _draw(
     work: Path, capture: Capture, rows: list[int], scales: Mapping[str, float], workers: int
 ) -> dict[int, list[list[Panel]]]:
     registered = _registered(work / "registration")
-    size = np.max([np.ptp(vertices, axis=0) for vertices in registered.vertices], axis=0)
-    framing = Framing(tuple(float(length) for length in size))
+    x, y, z = np.max([np.ptp(vertices, axis=0) for vertices in registered.vertices], axis=0).tolist()
+    framing = Framing((x, y, z))
     draw = partial(_draw_row, work, capture, framing, dict(scales))
     return dict(run_jobs(draw, rows, workers=workers, label="draw"))
 
