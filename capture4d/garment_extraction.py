@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from functools import lru_cache
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float32, UInt8
 from numba import njit
 from scipy import sparse
 from scipy.sparse import csgraph
@@ -24,7 +24,7 @@ from capture4d.errors import InputError
 from capture4d.mesh_kernels import face_components, open_vertices
 from capture4d.types import GarmentScan, Mesh, Scan
 
-__all__ = ["ColourNotFoundError", "classify_colours", "extract_garment"]
+__all__ = ["ColourNotFoundError", "classify_colours", "extract_garment", "painted_border"]
 
 Colour = tuple[int, int, int]
 
@@ -86,6 +86,26 @@ def extract_garment(
         loop_names=tuple(boundary_colours),
         frame_id=scan.frame_id,
     )
+
+
+def painted_border(
+    mesh: Mesh, colours: UInt8[np.ndarray, "verts 3"], paint: Colour, *, source: str = "scan"
+) -> Float32[np.ndarray, "points 3"]:
+    """Points on the border of a scan that is all garment, whatever its colours, but for one paint.
+
+    Raises:
+        ColourNotFoundError: the paint is not in the scan.
+    """
+    label = _label_table(paint, ())
+    quantised = (colours >> 2).astype(np.int32)
+    painted = label[(quantised[:, 0] << 12) | (quantised[:, 1] << 6) | quantised[:, 2]] == GARMENT
+    if painted.mean() < MIN_SHARE:
+        raise ColourNotFoundError(
+            f"{source}: border colour {_hex(paint)} not found: expected at least {100 * MIN_SHARE:g} % of the vertices, "
+            f"found {100 * painted.mean():.2g} %"
+        )
+    labels = settle_labels(mesh.faces, np.where(painted, FIRST_PAINT, GARMENT).astype(np.uint8))
+    return _border_points(mesh, labels, 1)[0]
 
 
 def classify_colours(

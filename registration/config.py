@@ -20,12 +20,14 @@ from typing import Literal
 __all__ = [
     "PAPER",
     "PRESETS",
+    "SOFT",
     "BoundaryConfig",
     "CoarseConfig",
     "DataConfig",
     "DenseConfig",
     "GraphConfig",
     "LinearSolverConfig",
+    "MeshRegistrationConfig",
     "QualityConfig",
     "RegistrationConfig",
     "Schedule",
@@ -205,3 +207,36 @@ PAPER = RegistrationConfig(
 )
 
 PRESETS: Mapping[str, RegistrationConfig] = {"default": RegistrationConfig(), "paper": PAPER}
+
+SOFT = RegistrationConfig(
+    graph=GraphConfig(nodes=300, vertices=0),
+    data=DataConfig(
+        rule="both_ways",
+        point_share=1.0,
+        smoothing_passes=0,
+        robust_scale=1.0,
+        min_normal_cosine=0.2,
+        normal_length=0.06,
+    ),
+    coarse=CoarseConfig(
+        cold=Schedule(40, (0.3, 0.12), rigid=(0.1, 0.01), smooth=(1000.0, 1.0)),
+    ),
+    dense=DenseConfig(
+        cold=Schedule(40, (0.12, 0.06), smooth=(30.0, 0.05)),
+        plasticity=0.0,
+    ),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class MeshRegistrationConfig:
+    """Any template onto any scan."""
+
+    boundary_colour: str = ""
+    """Paint on the scan's borders, RRGGBB; empty where none is painted."""
+    units: Literal["m", "cm", "mm", "auto"] = "auto"
+    """Of both files; decides the millimetres of the report, never the result."""
+    align: Literal["none", "rigid", "similarity"] = "none"
+    """Move the template onto the scan first, with scale for similarity; none if the two already lie on each other."""
+    registration: RegistrationConfig = SOFT
+    """Settings of the registration itself, for a template whose diagonal is 1.2 m."""

@@ -1,0 +1,170 @@
+"""Any template onto any scan: two mesh files in, the deformed template and its measures out.
+
+Everything is brought to one size before anything is decided by a length: the template's bounding box gets the diagonal
+of a shirt, for which the constants are made. Units therefore change the numbers of the report and nothing else.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from capture4d.errors import InputError
+from capture4d.garment_extraction import painted_border
+from capture4d.mesh import boundary_loops, submesh
+from capture4d.mesh_files import read_mesh, write_mesh
+from capture4d.scans import parse_colour
+from capture4d.types import Garment, GarmentScan, Mesh
+from capture4d.workdir import write_json
+from registration.alignment import Similarity, align
+from registration.config import MeshRegistrationConfig
+from registration.quality import FrameQuality, assess
+from registration.register import prepare_frame, register_frame
+from registration.template import analyse_template
+
+__all__ = ["MeshRegistration", "register_mesh", "run"]
+
+DIAGONAL = 1.2
+"""Diagonal of the template's bounding box while it is registered, metres: a shirt's."""
+METRES: Mapping[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeshRegistration:
+    """A registered mesh."""
+
+    vertices: Float32[np.ndarray, "verts 3"]
+    """In the template's order and the files' unit."""
+    start: Float64[np.ndarray, "verts 3"]
+    """The template after pre-alignment, in the files' unit."""
+    quality: FrameQuality
+    """Of the normalised problem; `numbers` in millimetres of the files' world."""
+
+
+def run(template_path: Path, scan_path: Path, output_path: Path, config: MeshRegistrationConfig) -> MeshRegistration:
+    """Register one mesh file to another; writes the result, and its measures as JSON beside it.
+
+    Args:
+        output_path: .ply, .obj or .glb; the JSON has the same name.
+    Raises:
+        InputError: a file is missing, damaged or empty, the colour is not in the scan, or the sizes cannot belong to
+            one unit.
+    """
+    begin = time.process_time()
+    template_file, scan_file = read_mesh(template_path), read_mesh(scan_path)
+    result = register_mesh(
+        template_file.mesh,
+        scan_file.mesh,
+        colours=scan_file.colours,
+        config=config,
+        template_name=str(template_path),
+        scan_name=str(scan_path),
+    )
+    mesh = template_file.mesh.with_vertices(result.vertices)
+    write_mesh(output_path, mesh, polygon_sizes=template_file.polygon_sizes)
+    units = config.units if config.units != "auto" else guess_units(template_file.mesh)
+    numbers = {key: value if math.isfinite(value) else None for key, value in result.quality.numbers.items()}
+    write_json(
+        output_path.with_suffix(".json"),
+        {
+            "template": str(template_path),
+            "scan": str(scan_path),
+            "units": units,
+            "verdict": result.quality.verdict,
+            "reasons": list(result.quality.reasons),
+            **numbers,
+            "cpu_s": round(time.process_time() - begin, 4),
+        },
+    )
+    return result
+
+
+def register_mesh(
+    template: Mesh,
+    scan: Mesh,
+    *,
+    colours: np.ndarray | None = None,
+    config: MeshRegistrationConfig,
+    template_name: str = "template",
+    scan_name: str = "scan",
+) -> MeshRegistration:
+    """Deform a template onto a scan; both in one unit, of any kind.
+
+    Args:
+        colours: (S, 3) uint8 of the scan's vertices, needed for `config.boundary_colour`.
+        template_name, scan_name: how errors call them.
+    """
+    size = _diagonal(template.vertices)
+    _require_one_unit(size, _diagonal(scan.vertices), template_name, scan_name)
+    scale, origin = DIAGONAL / size, template.vertices.astype(np.float64).mean(axis=0)
+
+    def normalised(points: np.ndarray) -> np.ndarray:
+        return scale * (points.astype(np.float64) - origin)
+
+    start = normalised(template.vertices)
+    garment_scan = _garment_scan(scan, normalised(scan.vertices), colours, config, scan_name)
+    if config.align != "none":
+        motion: Similarity = align(
+            start, garment_scan.mesh.vertices.astype(np.float64), with_scale=config.align == "similarity"
+        )
+        start = motion.apply(start)
+    loops = {f"border_{index}": loop for index, loop in enumerate(boundary_loops(template.faces))}
+    if config.boundary_colour and not loops:
+        raise InputError(f"{template_name}: expected open borders, for --boundary-colour is given; found none")
+    garment = Garment(Mesh(start.astype(np.float32), template.faces), loops)
+    analysis = analyse_template(garment, config.registration)
+    frame = prepare_frame(analysis, garment_scan, config.registration)
+    fitted = register_frame(analysis, frame, start, config=config.registration, schedule="cold")
+    quality = assess(analysis, frame, fitted.vertices, config.registration.quality)
+    metres = METRES[config.units if config.units != "auto" else guess_units(template)]
+    return MeshRegistration(
+        vertices=(fitted.vertices / scale + origin).astype(np.float32),
+        start=start / scale + origin,
+        quality=_in_units(quality, metres / scale),
+    )
+
+
+def guess_units(mesh: Mesh) -> str:
+    """m, cm or mm, from a size between a hand and a house."""
+    size = _diagonal(mesh.vertices)
+    return "m" if size < 8.0 else "cm" if size < 80.0 else "mm"
+
+
+def _in_units(quality: FrameQuality, factor: float) -> FrameQuality:
+    """Lengths of the normalised problem in those of the files' world."""
+    numbers = {key: value * factor if key.endswith("_mm") else value for key, value in quality.numbers.items()}
+    return FrameQuality(quality.verdict, quality.reasons, quality.residual_m * factor, numbers)
+
+
+def _diagonal(vertices: np.ndarray) -> float:
+    return float(np.linalg.norm(np.ptp(vertices.astype(np.float64), axis=0)))
+
+
+def _require_one_unit(template: float, scan: float, template_name: str, scan_name: str) -> None:
+    if not template > 0.0 or not scan > 0.0:
+        name = scan_name if template > 0.0 else template_name
+        raise InputError(f"{name}: expected a mesh with an extent, found all vertices in one place")
+    if not 0.05 < scan / template < 20.0:
+        raise InputError(
+            f"{scan_name}: expected the unit of {template_name}, which is {template:.4g} across; found {scan:.4g} across"
+        )
+
+
+def _garment_scan(
+    scan: Mesh, vertices: np.ndarray, colours: np.ndarray | None, config: MeshRegistrationConfig, name: str
+) -> GarmentScan:
+    """The whole scan, with the border points that its paint shows."""
+    mesh = Mesh(vertices.astype(np.float32), scan.faces)
+    if not config.boundary_colour:
+        none = np.zeros((0, 3), np.float32)
+        return GarmentScan(submesh(mesh, np.ones(len(mesh.faces), bool))[0], none, np.zeros(0, np.int32), (), 0)
+    if colours is None:
+        raise InputError(f"{name}: expected a colour per vertex for --boundary-colour, found none")
+    points = painted_border(mesh, colours, parse_colour(config.boundary_colour), source=name)
+    return GarmentScan(mesh, points, np.full(len(points), -1, np.int32), (), 0)
