@@ -240,7 +240,9 @@ def _scans(take: Take, clip: list) -> dict[str, float]:
             rig,
             [
                 Surface(truth, paint_garment(take.fine), LABEL_GARMENT, settings.fusion.garment_voxel_m),
-                Surface(Mesh(surface, body_faces), dress_colours(take.shaped), LABEL_BODY, settings.fusion.body_voxel_m),
+                Surface(
+                    Mesh(surface, body_faces), dress_colours(take.shaped), LABEL_BODY, settings.fusion.body_voxel_m
+                ),
             ],
             config=settings,
             rng=np.random.default_rng([take.config.seed, index]),
@@ -254,7 +256,7 @@ def _scans(take: Take, clip: list) -> dict[str, float]:
         accuracy.append(1e3 * np.median(errors.distance_m))
         angles.append(errors.normal_deg.mean())
         holes.append(100 * errors.hole_share)
-    return {
+    row = {
         "scan_cpu_s": cpu / len(clip),
         "scan_vertices": np.mean(vertices),
         "scan_vertices_least": np.min(vertices),
@@ -265,3 +267,4 @@ def _scans(take: Take, clip: list) -> dict[str, float]:
         "hole_percent_least": np.min(holes),
         "hole_percent_most": np.max(holes),
     }
+    return {key: float(value) for key, value in row.items()}

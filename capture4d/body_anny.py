@@ -49,7 +49,6 @@ def _bake(scratch: Path) -> Body:
     warp.config.log_level = warp.LOG_ERROR  # before anny loads: warp announces devices and compiled modules
     import anny
 
-    anny.paths.set_anny_cache_path(scratch)
     model = anny.Anny().to(dtype=torch.float32)
     rng = np.random.default_rng(0)
     phenotypes = _sample_adults(rng, tuple(model.phenotype_labels))

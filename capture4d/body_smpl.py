@@ -21,11 +21,32 @@ from capture4d.types import Body, Mesh
 
 __all__ = ["convert_smpl", "read_smpl"]
 
-SMPL_JOINTS = (
-    "pelvis left_hip right_hip spine1 left_knee right_knee spine2 left_ankle right_ankle spine3 left_foot right_foot "
-    "neck left_collar right_collar head left_shoulder right_shoulder left_elbow right_elbow left_wrist right_wrist "
-    "left_hand right_hand"
-).split()
+SMPL_JOINTS = [
+    "pelvis",
+    "left_hip",
+    "right_hip",
+    "spine1",
+    "left_knee",
+    "right_knee",
+    "spine2",
+    "left_ankle",
+    "right_ankle",
+    "spine3",
+    "left_foot",
+    "right_foot",
+    "neck",
+    "left_collar",
+    "right_collar",
+    "head",
+    "left_shoulder",
+    "right_shoulder",
+    "left_elbow",
+    "right_elbow",
+    "left_wrist",
+    "right_wrist",
+    "left_hand",
+    "right_hand",
+]
 EXPRESSION_START = 300
 """SMPL-X keeps expression directions behind this many shape directions."""
 MAX_SHAPES = 16
@@ -106,7 +127,7 @@ def _as_array(value: Any) -> np.ndarray | None:
     if isinstance(value, _Shell):
         state = value.state
         if "indptr" in state:  # a SciPy compressed sparse matrix
-            shape = state.get("_shape", state.get("shape"))
+            shape = state["_shape"] if "_shape" in state else state["shape"]
             kind = sparse.csr_matrix if len(state["indptr"]) == shape[0] + 1 else sparse.csc_matrix
             return kind((state["data"], state["indices"], state["indptr"]), shape=shape).toarray()
         return state.get("x")  # a chumpy array
@@ -131,7 +152,9 @@ def _assemble(fields: dict[str, np.ndarray]) -> Body:
         shape_directions=shapes.astype(np.float32),
         joints=(regressor @ template).astype(np.float32),
         joint_directions=np.einsum("jv,svc->sjc", regressor, shapes).astype(np.float32),
-        joint_names=tuple(SMPL_JOINTS) if joints == len(SMPL_JOINTS) else tuple(f"joint_{j:02d}" for j in range(joints)),
+        joint_names=tuple(SMPL_JOINTS)
+        if joints == len(SMPL_JOINTS)
+        else tuple(f"joint_{j:02d}" for j in range(joints)),
         parents=parents.astype(np.int32),
         skin_weights=np.asarray(fields["weights"]).astype(np.float32),
         pose_directions=pose_directions,

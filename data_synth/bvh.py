@@ -182,7 +182,7 @@ def retarget(shaped: ShapedBody, bvh: Bvh, fps: float, *, first_frame: int = 0) 
     names, joints, parents = shaped.body.joint_names, shaped.joints, shaped.body.parents
 
     facing = world[:, index[scheme.drives["root"]]][:, :, 2]
-    start = int(round(first_frame / fps / bvh.frame_time_s))
+    start = round(first_frame / fps / bvh.frame_time_s)
     yaw = np.arctan2(facing[start, 0], facing[start, 2])
     turn = Rotation.from_euler("y", -yaw).as_matrix()
 
@@ -218,9 +218,8 @@ def _match(bvh: Bvh) -> _Scheme:
     missing = [sorted(set(scheme.drives.values()) - have) for scheme in SCHEMES]
     best = int(np.argmin([len(each) for each in missing]))
     if missing[best]:
-        raise InputError(
-            f"{bvh.path}: expected joints named as in the CMU database, found none called {', '.join(missing[best][:4])}"
-        )
+        lacking = ", ".join(missing[best][:4])
+        raise InputError(f"{bvh.path}: expected joints named as in the CMU database, found none called {lacking}")
     return SCHEMES[best]
 
 

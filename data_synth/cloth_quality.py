@@ -61,6 +61,4 @@ def measure_cloth(
         reasons.append(f"{inside:.2f} % of the vertices inside the body")
     if crushed + over > 0.001 * len(area):
         reasons.append(f"{crushed} faces crushed and {over} overstretched")
-    return ClothQuality(
-        float(p1), float(p99), crushed, over, inside, 1e3 * float(max(depth.max(), 0)), tuple(reasons)
-    )
+    return ClothQuality(float(p1), float(p99), crushed, over, inside, 1e3 * float(max(depth.max(), 0)), tuple(reasons))

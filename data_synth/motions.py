@@ -232,7 +232,9 @@ def _sample_pose(shaped: ShapedBody, rng: np.random.Generator) -> np.ndarray:
     pose = np.repeat(np.eye(3)[None], len(names), axis=0)
     for name, limits in SPINE_LIMITS.items():
         angles = [_half_normal(limit, rng) for limit in limits]
-        pose[names.index(name)] = Rotation.from_euler("xzy", [angles[0], angles[2], angles[1]], degrees=True).as_matrix()
+        pose[names.index(name)] = Rotation.from_euler(
+            "xzy", [angles[0], angles[2], angles[1]], degrees=True
+        ).as_matrix()
     for side, sign in (("L", 1), ("R", -1)):
         shoulder, elbow = names.index(f"upperarm01.{side}"), names.index(f"lowerarm01.{side}")
         azimuth = np.radians(rng.uniform(*ARM_LIMITS["azimuth"]))

@@ -15,10 +15,10 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
-from scipy.optimize import brentq
+from scipy.optimize import root_scalar
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import ConvexHull, Delaunay, cKDTree
+from scipy.spatial import ConvexHull, Delaunay, KDTree
 
 from capture4d.body import ShapedBody
 from capture4d.mesh import boundary_loops
@@ -190,7 +190,8 @@ def _sleeve_panel(side: str, armhole_length: float, length: float) -> Panel:
             (half_width, 0), (0.62 * half_width, 0.05 * cap_height), (0.5 * half_width, cap_height), (0, cap_height)
         )
 
-    half = brentq(lambda width: _length(cap(width)) - armhole_length, 0.3 * armhole_length, armhole_length)
+    bracket = (0.3 * armhole_length, armhole_length)
+    half = float(root_scalar(lambda width: _length(cap(width)) - armhole_length, bracket=bracket).root)
     cuff = 0.86 * half
     mirror = np.array([-1.0, 1.0])
     seam = _line((cuff, -length), (half, 0))
@@ -313,7 +314,7 @@ def _triangulate(boundary: np.ndarray, spacing: float, rng: np.random.Generator)
     fractions = np.linspace(0, 1, 8, endpoint=False)[:, None, None]
     dense = (boundary * (1 - fractions) + np.roll(boundary, -1, axis=0) * fractions).reshape(-1, 2)
     grid = grid[_inside(grid, boundary)]
-    clear, _ = cKDTree(dense).query(grid, distance_upper_bound=0.6 * spacing)
+    clear, _ = KDTree(dense).query(grid, distance_upper_bound=0.6 * spacing)
     points = np.concatenate([boundary, grid[np.isinf(clear)]])
     faces = Delaunay(points).simplices
     a, b, c = points[faces].transpose(1, 0, 2)
@@ -342,7 +343,7 @@ def locate(mesh: PanelMesh, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         Faces (N,) int32 and barycentric coordinates (N, 3) float64. A point just outside, behind the chord of a curved
         edge, gets the nearest face and slightly negative coordinates, which extrapolate.
     """
-    candidates = cKDTree(mesh.uv.mean(axis=1)).query(uv, k=12)[1]
+    candidates = np.asarray(KDTree(mesh.uv.mean(axis=1)).query(uv, k=12)[1])
     a, b, c = (mesh.uv[candidates, corner] for corner in range(3))
     u, v, w = b - a, c - a, uv[:, None] - a
     area = u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation, Slerp
 
 from capture4d.body import PosedBody, ShapedBody, with_pose
@@ -82,7 +82,7 @@ def dress(shaped: ShapedBody, mesh: PanelMesh, pattern: Pattern, first: PosedBod
         rows = panel == name
         placed[rows, 0], placed[rows, 1] = sign * draft[rows, 0], draft[rows, 1] + LIFT_M
     seam_rows = np.unique(np.concatenate(list(mesh.seams.values())))
-    seams = cKDTree(placed[seam_rows[np.char.find(panel[seam_rows], "sleeve") < 0], :2])
+    seams = KDTree(placed[seam_rows[np.char.find(panel[seam_rows], "sleeve") < 0], :2])
     for name, sign in (("front", 1.0), ("back", -1.0)):
         rows = panel == name
         near = np.minimum(seams.query(placed[rows, :2])[0] / PILLOW_M, 1)
@@ -181,7 +181,7 @@ def _build_model(mesh: PanelMesh, start: np.ndarray, bodies: Sequence[PosedBody]
     builder = newton.ModelBuilder(up_axis=newton.Axis.Y)
     builder.add_cloth_mesh(
         pos=wp.vec3(0.0, 0.0, 0.0),
-        rot=wp.quat_identity(),
+        rot=wp.quat(0.0, 0.0, 0.0, 1.0),
         scale=1.0,
         vel=wp.vec3(0.0, 0.0, 0.0),
         vertices=[wp.vec3(*point) for point in start],
@@ -202,7 +202,7 @@ def _build_model(mesh: PanelMesh, start: np.ndarray, bodies: Sequence[PosedBody]
     y = along[:, 0] * side[:, 1] - along[:, 1] * side[:, 0]
     areas = 0.5 * length * y
     builder.tri_poses = [
-        wp.mat22(*np.linalg.inv([[l, p], [0.0, q]]).ravel()) for l, p, q in zip(length, x, y, strict=True)
+        wp.mat22(*np.linalg.inv([[base, p], [0.0, q]]).ravel()) for base, p, q in zip(length, x, y, strict=True)
     ]
     builder.tri_areas = areas.tolist()
     builder.edge_rest_angle = [0.0] * len(builder.edge_rest_angle)
@@ -216,6 +216,9 @@ def _build_model(mesh: PanelMesh, start: np.ndarray, bodies: Sequence[PosedBody]
     model.soft_contact_ke, model.soft_contact_kd, model.soft_contact_mu = 1e4, 1e-3, fabric.friction
     # newton computes the box of a collider once: make it hold the whole motion.
     joints = np.concatenate([each.transforms[:, :3, 3] + each.shaped.joints for each in bodies])
-    model.shape_collision_aabb_lower.assign((joints.min(axis=0) - 2.0).astype(np.float32)[None])
-    model.shape_collision_aabb_upper.assign((joints.max(axis=0) + 2.0).astype(np.float32)[None])
+    lower, upper = model.shape_collision_aabb_lower, model.shape_collision_aabb_upper
+    assert lower is not None
+    assert upper is not None
+    lower.assign((joints.min(axis=0) - 2.0).astype(np.float32)[None])
+    upper.assign((joints.max(axis=0) + 2.0).astype(np.float32)[None])
     return model, body

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from capture4d.body import PosedBody, ShapedBody, pose_frame, with_shape
@@ -110,9 +111,7 @@ def run(output: Path, config: SynthConfig, *, workers: int = 2, overwrite: bool 
 
     Simulation is sequential and starts over when it was interrupted; scans are made in parallel and kept.
     """
-    stage = open_stage(
-        output, name="synth", schema=SCHEMA, config=config, upstream={}, overwrite=overwrite
-    )
+    stage = open_stage(output, name="synth", schema=SCHEMA, config=config, upstream={}, overwrite=overwrite)
     frame_ids = list(range(1, config.frames + 1))
     if stage.pending(frame_ids, folder="truth"):
         if stage.pending(frame_ids, folder="truth") and not (stage.path / "cloth" / "complete.json").exists():
@@ -155,7 +154,7 @@ class _ScanJob:
     frame_id: int
 
 
-def simulate_take(take: Take):
+def simulate_take(take: Take) -> Iterator[tuple[int, np.ndarray, np.ndarray | None]]:
     """Simulate a take, coarse and fine.
 
     Yields:
@@ -196,6 +195,8 @@ def _simulate(job: _SimulationJob) -> None:
         if step == config.simulation.calm_frames - 1:
             dressed = carry(take.coarse, take.template, coarse)
         if index == 0:
+            assert dressed is not None
+            assert fine is not None
             _write_model(take, folder, dressed, coarse, fine)
         if fine is None:
             continue
@@ -270,7 +271,7 @@ def paint_garment(mesh: PanelMesh) -> np.ndarray:
     """sRGB per vertex, (V, 3) uint8: the garment's colour, and a painted band along every border of the pattern."""
     border = np.concatenate(list(mesh.loops.values()))
     corners = np.isin(mesh.faces, border)
-    painted = cKDTree(mesh.uv[corners]).query(mesh.vertex_uv, distance_upper_bound=BORDER_BAND_M)[0] < BORDER_BAND_M
+    painted = KDTree(mesh.uv[corners]).query(mesh.vertex_uv, distance_upper_bound=BORDER_BAND_M)[0] < BORDER_BAND_M
     return np.where(painted[:, None], BORDER_COLOUR, GARMENT_COLOUR).astype(np.uint8)
 
 

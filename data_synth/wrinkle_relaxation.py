@@ -66,9 +66,7 @@ class BodyPlanes:
     """(V, 3) smooth body normals there."""
 
 
-def wrinkle_mesh(
-    coarse: PanelMesh, fine: PanelMesh, config: RelaxationConfig, rng: np.random.Generator
-) -> WrinkleMesh:
+def wrinkle_mesh(coarse: PanelMesh, fine: PanelMesh, config: RelaxationConfig, rng: np.random.Generator) -> WrinkleMesh:
     """Precompute the stencils of a fine mesh over a coarse one of the same pattern.
 
     Args:
@@ -113,9 +111,17 @@ def _hinges(mesh: PanelMesh) -> tuple[np.ndarray, np.ndarray]:
     """Bending stencils of the inner edges from the pattern's angles; seams bend like the cloth around them."""
     lengths = _corner_lengths(mesh)
     squared = lengths**2
-    heron = 4 * np.linalg.norm(
-        np.cross(np.pad(mesh.uv[:, 1] - mesh.uv[:, 0], ((0, 0), (0, 1))), np.pad(mesh.uv[:, 2] - mesh.uv[:, 0], ((0, 0), (0, 1)))), axis=1
-    ) / 2
+    heron = (
+        4
+        * np.linalg.norm(
+            np.cross(
+                np.pad(mesh.uv[:, 1] - mesh.uv[:, 0], ((0, 0), (0, 1))),
+                np.pad(mesh.uv[:, 2] - mesh.uv[:, 0], ((0, 0), (0, 1))),
+            ),
+            axis=1,
+        )
+        / 2
+    )
     cotangents = (squared[:, [1, 2, 0]] + squared[:, [2, 0, 1]] - squared) / heron[:, None]  # at each corner
 
     corners = np.array([[0, 1, 2], [1, 2, 0], [2, 0, 1]])  # edge start, edge end, opposite corner
@@ -247,7 +253,21 @@ def _material_frames(mesh: WrinkleMesh, base: np.ndarray, normals: np.ndarray) -
 
 @njit(cache=True, fastmath=True, nogil=True)
 def _relax(
-    x, base, normals, edges, lengths, hinges, weights, bend, pull_n, pull_t, radius, planes, plane_normals, margin, sweeps
+    x,
+    base,
+    normals,
+    edges,
+    lengths,
+    hinges,
+    weights,
+    bend,
+    pull_n,
+    pull_t,
+    radius,
+    planes,
+    plane_normals,
+    margin,
+    sweeps,
 ):
     one, half = np.float32(1), np.float32(0.5)
     for sweep in range(sweeps):

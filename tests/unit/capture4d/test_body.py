@@ -13,6 +13,7 @@ from capture4d.body import skin, unskin, with_pose, with_shape
 from capture4d.body_smpl import read_smpl
 from capture4d.errors import InputError
 from capture4d.types import Body, Mesh
+from capture4d.workdir import write_npz
 
 
 def make_body(joints: int = 4, verts: int = 60, seed: int = 0) -> Body:
@@ -103,7 +104,7 @@ def smpl_fields(seed: int = 0) -> dict[str, np.ndarray]:
 
 def test_smpl_npz_and_pickle_give_the_same_body(tmp_path: Path) -> None:
     fields = smpl_fields()
-    np.savez(tmp_path / "body.npz", **fields)
+    write_npz(tmp_path / "body.npz", **fields)
     (tmp_path / "body.pkl").write_bytes(pickle.dumps(fields, protocol=2))
     first, second = read_smpl(tmp_path / "body.npz"), read_smpl(tmp_path / "body.pkl")
     np.testing.assert_array_equal(first.joints, second.joints)
@@ -115,7 +116,7 @@ def test_smpl_npz_and_pickle_give_the_same_body(tmp_path: Path) -> None:
 
 def test_smpl_pose_correctives_vanish_at_rest_and_act_elsewhere(tmp_path: Path) -> None:
     fields = smpl_fields()
-    np.savez(tmp_path / "body.npz", **fields)
+    write_npz(tmp_path / "body.npz", **fields)
     body = read_smpl(tmp_path / "body.npz")
     shaped = with_shape(body, np.zeros(0))
     identity = np.repeat(np.eye(3)[None], 24, axis=0)
@@ -143,6 +144,6 @@ def test_pickle_with_anything_but_arrays_is_refused(tmp_path: Path, monkeypatch:
 def test_missing_parts_are_named(tmp_path: Path) -> None:
     fields = smpl_fields()
     del fields["weights"]
-    np.savez(tmp_path / "body.npz", **fields)
+    write_npz(tmp_path / "body.npz", **fields)
     with pytest.raises(InputError, match=r"body\.npz: expected an SMPL-family body, found no weights"):
         read_smpl(tmp_path / "body.npz")

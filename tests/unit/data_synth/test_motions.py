@@ -76,7 +76,9 @@ def test_sampled_poses_keep_limits_and_stay_out_of_the_trunk(person: ShapedBody)
     poses = make_motion(person, MotionConfig("sampled"), 60.0, 400, np.random.default_rng(1))
     names = person.body.joint_names
     for joint, limits in SPINE_LIMITS.items():
-        angles = Rotation.from_matrix(poses.rotations[:, names.index(joint)]).as_euler("xzy", degrees=True)[:, [0, 2, 1]]
+        angles = Rotation.from_matrix(poses.rotations[:, names.index(joint)]).as_euler("xzy", degrees=True)[
+            :, [0, 2, 1]
+        ]
         for axis, (low, high) in enumerate(limits):
             assert angles[:, axis].min() > low - 4  # between two poses the interpolation may lean out a little
             assert angles[:, axis].max() < high + 4

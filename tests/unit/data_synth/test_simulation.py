@@ -63,7 +63,10 @@ def test_equal_input_gives_equal_bits(simulated) -> None:
 @pytest.mark.slow
 def test_template_is_bound_where_it_lies(simulated) -> None:
     mesh, bodies, _, frames = simulated
-    garment = bind_template(mesh, frames[SETTINGS.calm_frames - 1], bodies[SETTINGS.calm_frames - 1], frames[-1], bodies[-1])
+    garment = bind_template(
+        mesh, frames[SETTINGS.calm_frames - 1], bodies[SETTINGS.calm_frames - 1], frames[-1], bodies[-1]
+    )
+    assert garment.skin_weights is not None
     rest, flagged = unskin(frames[-1], garment.skin_weights, bodies[-1].transforms)
     assert not flagged.any()
     np.testing.assert_allclose(rest, garment.template.vertices, atol=1e-5)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ BODY_FACES = np.array([[0, 1, 2]], np.int32)
 
 def square(vertices: int, seed: int) -> PanelMesh:
     corners = np.array([[0, 0], [SIDE, 0], [SIDE, SIDE], [0, SIDE], [0, 0]], float)
-    edges = tuple(Edge(np.linspace(a, b, 20), "rim|sheet") for a, b in zip(corners, corners[1:], strict=False))
+    edges = tuple(Edge(np.linspace(a, b, 20), "rim|sheet") for a, b in pairwise(corners))
     return mesh_pattern(Pattern((Panel("sheet", edges),), ("rim",)), vertices, np.random.default_rng(seed))
 
 
@@ -97,9 +98,7 @@ def test_folds_of_two_starts_meet(sheets) -> None:
     for start in (0, 15):
         offsets = None
         for frame in frames[start:]:
-            folded, offsets = relax_frame(
-                wrinkles, frame, FAR_BODY, BODY_FACES, offsets, Fabric(), RelaxationConfig()
-            )
+            folded, offsets = relax_frame(wrinkles, frame, FAR_BODY, BODY_FACES, offsets, Fabric(), RelaxationConfig())
         ends.append(folded)
     assert np.abs(ends[0] - ends[1])[:, 2].mean() < 0.25 * np.abs(ends[0][:, 2]).mean()
 
