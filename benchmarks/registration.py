@@ -1,0 +1,355 @@
+"""Registration against the truth, and against what else one can install.
+
+Three kinds of data: `synth`, a synthetic take of a T-shirt on a moving body (made once, kept in the user's cache);
+`diffcloth`, a shirt simulated by somebody else, scanned by our scanner; `faces`, six faces in dense correspondence and
+one real scan. The last two are read from the folder `shared/data` beside the project.
+
+Limits this was built against, on a take of 120 frames with a template of 5,000 vertices and scans of 200,000: truth
+distance 0.4 mm mean and 1.2 at 95 %, border 1.5 and 4 mm, correspondence 0.6 of the best peer's, drift ratio 1.2, warm
+0.25 and cold 0.8 CPU s, 40 times less than nricp_amberg, 700 MB.
+
+Peers start where ours starts and are timed in the same way: process time, all threads.
+"""
+
+from __future__ import annotations
+
+import resource
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from rich.console import Console
+from scipy.spatial import cKDTree
+
+from benchmarks.metric import Metric
+from benchmarks.peers import PEERS, run_peer
+from capture4d.evaluation import (
+    border_errors,
+    correspondence_errors,
+    drift_ratio,
+    material_points,
+    surface_distances,
+    truth_distances,
+)
+from capture4d.garment_stage import load_garment_scan
+from capture4d.garment_stage import run as extract
+from capture4d.mesh_files import read_mesh
+from capture4d.scans import (
+    Capture,
+    read_body,
+    read_capture,
+    read_poses,
+    read_template,
+    read_truth_model,
+    read_truth_vertices,
+)
+from capture4d.types import Garment, GarmentScan, Mesh
+from capture4d.workdir import read_json
+from registration.config import PAPER, MeshRegistrationConfig, RegistrationConfig
+from registration.register import prepare_frame, register_frame
+from registration.register_mesh import register_mesh
+from registration.sequence import Mover
+from registration.stage import run as register
+from registration.template import analyse_template
+
+SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+COVERED_M = 0.005
+"""A template vertex has scan data if its true place has a scan vertex this near."""
+FACES = ("SIMPOP_01", "SIMPOP_05", "SIMPOP_10", "SIMPOP_15", "SIMPOP_20", "SIMPOP_25")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Case:
+    """One frame with its truth, metres."""
+
+    name: str
+    scan: GarmentScan
+    start: np.ndarray
+    """(V, 3) template vertices where every method starts."""
+    truth: Mesh
+    """The noise-free surface."""
+    places: np.ndarray
+    """(V, 3) true places of the template's vertices."""
+    true_borders: Mapping[str, np.ndarray]
+
+    def covered(self) -> np.ndarray:
+        return cKDTree(self.scan.mesh.vertices).query(self.places)[0] < COVERED_M
+
+
+@dataclass(frozen=True, slots=True)
+class Scores:
+    """Means over frames of one method, millimetres and CPU seconds."""
+
+    truth_distance_mean_mm: float
+    truth_distance_p95_mm: float
+    missed_mean_mm: float
+    """True surface to the registered one."""
+    border_mean_mm: float
+    border_p95_mm: float
+    correspondence_mean_mm: float
+    correspondence_p95_mm: float
+    cpu_s: float
+
+
+def run(
+    *,
+    quick: bool = False,
+    data: Literal["synth", "diffcloth", "faces"] = "synth",
+    frames: int = 120,
+    compared: int = 6,
+    workers: int = 2,
+) -> list[Metric]:
+    """Register a take, and single frames of it with every method.
+
+    Args:
+        quick: few frames of a small take; the same keys.
+        data: see above.
+        frames: of the take (synth).
+        compared: frames on which all methods start from the same place.
+        workers: processes that make the take; registration itself is measured in one.
+    """
+    if data == "faces":
+        return _faces(2 if quick else len(FACES))
+    with tempfile.TemporaryDirectory(prefix="capture4d-registration-") as scratch:
+        if data == "diffcloth":
+            capture = _scanned_diffcloth(Path(scratch) / "capture", 4 if quick else 13, workers)
+            return _take(capture, Path(scratch), 3 if quick else compared, start="previous")
+        return _take(_synthetic_take(quick, frames, workers), Path(scratch), 2 if quick else compared, start="skinned")
+
+
+def _synthetic_take(quick: bool, frames: int, workers: int) -> Path:
+    from data_synth.cached_takes import cached_take
+    from data_synth.config import PRESETS
+
+    small = replace(PRESETS["tiny"], frames=12)
+    return cached_take(small if quick else replace(PRESETS["tshirt-200k"], frames=frames), workers=workers)
+
+
+def _scanned_diffcloth(output: Path, frames: int, workers: int) -> Path:
+    from data_synth.scan_stage import run as scan
+    from data_synth.scanner_config import ScanConfig
+
+    meshes = _shared("diffcloth-tshirt/sequence_a.npz")
+    scan(meshes, output, ScanConfig(height_m=0.7, frames=frames, step=10, fps=60.0), workers=workers)
+    return output
+
+
+def _shared(name: str) -> Path:
+    path = SHARED / name
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: this benchmark needs the third-party data beside the project")
+    return path
+
+
+# --- a take ------------------------------------------------------------------------------------------------------
+
+
+def _take(folder: Path, scratch: Path, compared: int, *, start: Literal["skinned", "previous"]) -> list[Metric]:
+    capture = read_capture(folder)
+    extract(folder, scratch / "garment")
+    peak_mb = _peak_rss(folder, scratch / "garment", scratch / "registration")
+    short_mb = _peak_rss(_first_frames(capture, scratch / "short"), None, scratch / "short-work")
+    records = [read_json(path) for path in sorted((scratch / "registration" / "metrics").glob("*.json"))]
+    garment = read_template(capture)
+
+    def load(frame_id: int) -> np.ndarray:
+        with np.load(scratch / "registration" / "frames" / f"{frame_id:06d}.npz") as arrays:
+            return arrays["vertices"]
+
+    cases = _cases(capture, scratch / "garment", start)
+    whole = [_score(garment, case, load(capture.frame_ids[row]), 0.0) for row, case in enumerate(cases(None))]
+    take = _mean(whole)
+    warm = [record["cpu_s"] for record in records if "warm" in record["started_from"]]
+    cold = [record["cpu_s"] for record in records[1:] if "cold" in record["started_from"]]
+    metrics = [
+        Metric("truth_distance_mean_mm", take.truth_distance_mean_mm, "mm"),
+        Metric("truth_distance_p95_mm", take.truth_distance_p95_mm, "mm"),
+        Metric("missed_mean_mm", take.missed_mean_mm, "mm"),
+        Metric("border_mean_mm", take.border_mean_mm, "mm"),
+        Metric("border_p95_mm", take.border_p95_mm, "mm"),
+        Metric("correspondence_mean_mm", take.correspondence_mean_mm, "mm"),
+        Metric("correspondence_p95_mm", take.correspondence_p95_mm, "mm"),
+        Metric("drift_ratio", drift_ratio(np.array([scores.correspondence_mean_mm for scores in whole]))),
+        Metric("warm_cpu_s", _median(warm), "s"),
+        Metric("cold_cpu_s", _median(cold), "s"),
+        Metric("peak_rss_mb", peak_mb, "MB"),
+        Metric("rss_growth_mb", peak_mb - short_mb, "MB"),
+        Metric("failed_frames", float(sum(record["verdict"] == "failed" for record in records))),
+    ]
+    return metrics + _comparison(garment, list(cases(compared)), _median(warm))
+
+
+def _cases(
+    capture: Capture, garment_folder: Path, start: Literal["skinned", "previous"]
+) -> Callable[[int | None], Iterator[Case]]:
+    """Frames with their truth: all of a take, or so many spread over it."""
+    model, garment, config = read_truth_model(capture), read_template(capture), RegistrationConfig()
+    assert model is not None, "these takes come with their truth"
+    mover = Mover.create(analyse_template(garment, config), read_body(capture), read_poses(capture))
+
+    def places(fine: np.ndarray) -> np.ndarray:
+        return material_points(fine, model.fine.faces, model.template_faces, model.template_barycentric)
+
+    def generate(count: int | None) -> Iterator[Case]:
+        total = len(capture.frame_ids)
+        for row in range(total) if count is None else np.linspace(1, total - 1, count).round().astype(int).tolist():
+            frame_id = capture.frame_ids[row]
+            fine = read_truth_vertices(capture, frame_id)
+            before = read_truth_vertices(capture, capture.frame_ids[max(row - 1, 0)])
+            yield Case(
+                name=f"frame {frame_id}",
+                scan=load_garment_scan(garment_folder / "frames" / f"{frame_id:06d}.npz", frame_id),
+                start=places(before) if mover is None or start == "previous" else mover.skinned(row),
+                truth=Mesh(fine, model.fine.faces),
+                places=places(fine),
+                true_borders={name: fine[loop] for name, loop in model.loops.items()},
+            )
+
+    return generate
+
+
+def _comparison(garment: Garment, cases: Sequence[Case], warm_cpu_s: float) -> list[Metric]:
+    """Ours, its ablations and the peers, from the same starts."""
+    default = RegistrationConfig()
+    boundary = default.boundary
+    ours = {
+        "cold": default,
+        "paper": PAPER,
+        "no_border": replace(default, boundary=replace(boundary, coarse_rule="none", dense_rule="none")),
+        "nearest": replace(default, boundary=replace(boundary, coarse_rule="nearest", dense_rule="nearest")),
+        "eq2": replace(default, boundary=replace(boundary, coarse_rule="argmax", dense_rule="argmax")),
+    }
+    scores: dict[str, Scores] = {}
+    for name, config in ours.items():
+        analysis = analyse_template(garment, config)
+        rows = []
+        for case in cases:
+            begin = time.process_time()
+            fitted = register_frame(analysis, prepare_frame(analysis, case.scan, config), case.start, config=config)
+            rows.append(_score(garment, case, fitted.vertices, time.process_time() - begin))
+        scores[name] = _mean(rows)
+    faces = garment.template.faces
+    for name in PEERS:
+        rows = []
+        for case in cases:
+            Console(stderr=True).print(f"{name}, {case.name}")
+            scan = case.scan.mesh
+            result = run_peer(name, case.start, faces, scan.vertices.astype(np.float64), scan.faces)
+            rows.append(_score(garment, case, result.vertices, result.cpu_s))
+        scores[name] = _mean(rows)
+    return _comparison_metrics(scores, warm_cpu_s)
+
+
+def _comparison_metrics(scores: Mapping[str, Scores], warm_cpu_s: float) -> list[Metric]:
+    metrics = []
+    for name, score in scores.items():
+        for key in Scores.__dataclass_fields__:
+            metrics.append(Metric(f"{name}_{key}", getattr(score, key), "s" if key == "cpu_s" else "mm"))
+    best = {
+        key: min(getattr(scores[name], key) for name in PEERS)
+        for key in ("truth_distance_mean_mm", "truth_distance_p95_mm", "missed_mean_mm", "correspondence_mean_mm")
+    }
+    for key, value in best.items():
+        metrics.append(Metric(f"{key.removesuffix('_mm')}_ratio_to_best_peer", getattr(scores["cold"], key) / value))
+    metrics.append(
+        Metric("cpu_ratio_to_nricp_amberg", scores["nricp_amberg"].cpu_s / warm_cpu_s, "", "higher")
+    )
+    return metrics
+
+
+def _score(garment: Garment, case: Case, vertices: np.ndarray, cpu_s: float) -> Scores:
+    registered = Mesh(vertices.astype(np.float32), garment.template.faces)
+    there, back = truth_distances(registered, case.truth, covered=case.covered())
+    borders = border_errors({name: vertices[loop] for name, loop in garment.loops.items()}, case.true_borders)
+    matched = correspondence_errors(vertices, case.places)
+    values = [
+        there.mean(), np.percentile(there, 95), back.mean(), borders.mean(), np.percentile(borders, 95),
+        matched.mean(), np.percentile(matched, 95),
+    ]  # fmt: skip
+    return Scores(*(float(1e3 * value) for value in values), cpu_s)
+
+
+def _mean(scores: Sequence[Scores]) -> Scores:
+    return Scores(*(float(np.mean([getattr(s, key) for s in scores])) for key in Scores.__dataclass_fields__))
+
+
+def _median(values: Sequence[float]) -> float:
+    return float(np.median(values)) if len(values) else float("nan")
+
+
+# --- memory ------------------------------------------------------------------------------------------------------
+
+
+def _peak_rss(capture: Path, garment: Path | None, output: Path) -> float:
+    """Largest resident set of a process that registers the capture, MB."""
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        return pool.submit(_register_and_measure, capture, garment, output).result()
+
+
+def _register_and_measure(capture: Path, garment: Path | None, output: Path) -> float:
+    if garment is None:
+        garment = output / "garment"
+        extract(capture, garment)
+        output = output / "registration"
+    register(capture, garment, output, RegistrationConfig(), workers=1)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def _first_frames(capture: Capture, folder: Path) -> Path:
+    """The first third of a take, as a capture of links to it."""
+    folder.mkdir()
+    for path in capture.path.iterdir():
+        if path.name != "capture.json":
+            (folder / path.name).symlink_to(path.resolve())
+    from capture4d.scans import write_capture_description
+
+    kept = capture.frame_ids[: max(2, len(capture.frame_ids) // 3)]
+    write_capture_description(replace(capture, path=folder, frame_ids=kept))
+    return folder
+
+
+# --- faces -------------------------------------------------------------------------------------------------------
+
+
+def _faces(count: int) -> list[Metric]:
+    """A face template to faces in dense correspondence, and to a real scan without; all start rigidly aligned."""
+    template = _face("Template")
+    config = MeshRegistrationConfig(align="rigid", units="m")
+    rows: dict[str, list[list[float]]] = {name: [] for name in ("ours", *PEERS)}
+    real: dict[str, float] = {}
+    for name in [*FACES[:count], "DemoFace_10K"]:
+        scan = _face(name)
+        begin = time.process_time()
+        result = register_mesh(template, scan, config=config)
+        found = {"ours": (result.vertices.astype(np.float64), time.process_time() - begin)}
+        for peer in PEERS:
+            Console(stderr=True).print(f"{peer}, {name}")
+            answer = run_peer(peer, result.start, template.faces, scan.vertices.astype(np.float64), scan.faces)
+            found[peer] = (answer.vertices, answer.cpu_s)
+        for method, (vertices, cpu_s) in found.items():
+            there = 1e3 * surface_distances(scan, vertices)
+            if name not in FACES:
+                real[method] = float(np.median(there))
+                continue
+            back = 1e3 * surface_distances(Mesh(vertices.astype(np.float32), template.faces), scan.vertices)
+            matched = 1e3 * correspondence_errors(vertices, scan.vertices)
+            rows[method].append([there.mean(), back.mean(), matched.mean(), np.percentile(matched, 95), cpu_s])
+    keys = ("truth_distance_mean_mm", "missed_mean_mm", "correspondence_mean_mm", "correspondence_p95_mm", "cpu_s")
+    metrics = [
+        Metric(f"{method}_{key}", value, "s" if key == "cpu_s" else "mm")
+        for method, values in rows.items()
+        for key, value in zip(keys, np.mean(values, axis=0).tolist(), strict=True)
+    ]
+    return metrics + [Metric(f"{method}_real_scan_distance_median_mm", value, "mm") for method, value in real.items()]
+
+
+def _face(name: str) -> Mesh:
+    """A face in metres; the files are in millimetres."""
+    mesh = read_mesh(_shared(f"face-templates/{name}.obj")).mesh
+    return mesh.with_vertices((mesh.vertices / 1000).astype(np.float32))
