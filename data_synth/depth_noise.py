@@ -86,7 +86,12 @@ def corrupt_depth(
     near_edge = edge
     for _ in range(2):
         near_edge = _window(np.logical_or, _window(np.logical_or, near_edge, 0), 1)
-    lost = edge | (near_edge & (blobs > 0)) | (cosine < config.lost_cosine) | (blobs > _level(config.blob_loss))
+    lost = (
+        edge
+        | (near_edge & (blobs > _level(config.silhouette_loss)))
+        | (cosine < config.lost_cosine)
+        | (blobs > _level(config.blob_loss))
+    )
     lost |= (cosine < config.weak_cosine) & (blobs < -_level(config.weak_loss))
     spread = config.sigma_m * (depth / config.reference_depth_m) ** 2 / np.maximum(cosine, config.grazing_floor)
     return np.where(lost, np.float32(0), depth + (spread * noise).astype(np.float32))

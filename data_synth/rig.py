@@ -14,7 +14,7 @@ Point = tuple[float, float, float] | np.ndarray
 
 # (name, share of the cameras, distance from the axis, height, height looked at); lengths in radii of the subject, and
 # heights from its centre. The middle ring just sees the whole sphere. At a radius of 0.6 m (a shirt over a range of
-# motion) cameras stand 1.5 m away; the low ring looks down at the legs and the upper one up at the head, as a lab's does.
+# motion) cameras stand 1.5 m away; the low ring looks down at the legs and the upper one up at the head.
 RINGS: tuple[tuple[str, float, float, float, float], ...] = (
     ("low", 0.25, 2.47, -1.30, -0.30),
     ("middle", 0.35, 2.47, 0.0, 0.0),

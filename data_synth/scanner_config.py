@@ -38,6 +38,8 @@ class NoiseConfig:
     """Noise grows with 1/cos of the angle to the surface normal, down to this cosine."""
     silhouette_step_m: float = 0.012
     """A larger step of depth between neighbouring pixels is a silhouette: both sides are lost."""
+    silhouette_loss: float = 0.5
+    """Share of the next two pixels that is lost as well, in blobs."""
     lost_cosine: float = 0.2
     """Surfaces seen flatter than this cosine are lost."""
     weak_cosine: float = 0.35
