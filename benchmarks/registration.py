@@ -48,6 +48,7 @@ from capture4d.scans import (
     read_template,
     read_truth_model,
     read_truth_vertices,
+    write_capture_description,
 )
 from capture4d.types import Garment, GarmentScan, Mesh
 from capture4d.workdir import read_json
@@ -120,15 +121,16 @@ def run(
         if data == "diffcloth":
             capture = _scanned_diffcloth(Path(scratch) / "capture", 4 if quick else 13, workers)
             return _take(capture, Path(scratch), 3 if quick else compared, start="previous")
-        return _take(_synthetic_take(quick, frames, workers), Path(scratch), 2 if quick else compared, start="skinned")
+        take = read_capture(_synthetic_take(quick, workers))
+        capture = _first_frames(take, Path(scratch) / "capture", frames)
+        return _take(capture, Path(scratch), 2 if quick else compared, start="skinned")
 
 
-def _synthetic_take(quick: bool, frames: int, workers: int) -> Path:
+def _synthetic_take(quick: bool, workers: int) -> Path:
     from data_synth.cached_takes import cached_take
     from data_synth.config import PRESETS
 
-    small = replace(PRESETS["tiny"], frames=12)
-    return cached_take(small if quick else replace(PRESETS["tshirt-200k"], frames=frames), workers=workers)
+    return cached_take(replace(PRESETS["tiny"], frames=12) if quick else PRESETS["tshirt-200k"], workers=workers)
 
 
 def _scanned_diffcloth(output: Path, frames: int, workers: int) -> Path:
@@ -154,7 +156,8 @@ def _take(folder: Path, scratch: Path, compared: int, *, start: Literal["skinned
     capture = read_capture(folder)
     extract(folder, scratch / "garment")
     peak_mb = _peak_rss(folder, scratch / "garment", scratch / "registration")
-    short_mb = _peak_rss(_first_frames(capture, scratch / "short"), None, scratch / "short-work")
+    third = _first_frames(capture, scratch / "short", max(2, len(capture.frame_ids) // 3))
+    short_mb = _peak_rss(third, None, scratch / "short-work")
     records = [read_json(path) for path in sorted((scratch / "registration" / "metrics").glob("*.json"))]
     garment = read_template(capture)
 
@@ -219,7 +222,7 @@ def _comparison(garment: Garment, cases: Sequence[Case], warm_cpu_s: float) -> l
     default = RegistrationConfig()
     boundary = default.boundary
     ours = {
-        "cold": default,
+        "default": default,
         "paper": PAPER,
         "no_border": replace(default, boundary=replace(boundary, coarse_rule="none", dense_rule="none")),
         "nearest": replace(default, boundary=replace(boundary, coarse_rule="nearest", dense_rule="nearest")),
@@ -256,7 +259,7 @@ def _comparison_metrics(scores: Mapping[str, Scores], warm_cpu_s: float) -> list
         for key in ("truth_distance_mean_mm", "truth_distance_p95_mm", "missed_mean_mm", "correspondence_mean_mm")
     }
     for key, value in best.items():
-        metrics.append(Metric(f"{key.removesuffix('_mm')}_ratio_to_best_peer", getattr(scores["cold"], key) / value))
+        metrics.append(Metric(f"{key.removesuffix('_mm')}_ratio_to_best_peer", getattr(scores["default"], key) / value))
     metrics.append(
         Metric("cpu_ratio_to_nricp_amberg", scores["nricp_amberg"].cpu_s / warm_cpu_s, "", "higher")
     )
@@ -301,16 +304,13 @@ def _register_and_measure(capture: Path, garment: Path | None, output: Path) -> 
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def _first_frames(capture: Capture, folder: Path) -> Path:
-    """The first third of a take, as a capture of links to it."""
+def _first_frames(capture: Capture, folder: Path, count: int) -> Path:
+    """The first frames of a take, as a capture of links to it."""
     folder.mkdir()
     for path in capture.path.iterdir():
         if path.name != "capture.json":
             (folder / path.name).symlink_to(path.resolve())
-    from capture4d.scans import write_capture_description
-
-    kept = capture.frame_ids[: max(2, len(capture.frame_ids) // 3)]
-    write_capture_description(replace(capture, path=folder, frame_ids=kept))
+    write_capture_description(replace(capture, path=folder, frame_ids=capture.frame_ids[:count]))
     return folder
 
 

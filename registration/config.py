@@ -143,8 +143,11 @@ class DenseConfig:
 class SequenceConfig:
     """How a take is cut up and where each frame starts."""
 
-    keyframe_spacing: int = 10
-    """Every n-th frame is a keyframe, registered from the keyframe before; the frames between run in parallel."""
+    segment: int = 240
+    """Fewest frames between keyframes. Segments start from keyframes and run in parallel; shorter ones are faster on
+    many cores, and forget more often how the cloth has slid."""
+    keyframe_bend_deg: float = 8.0
+    """A keyframe's joints are at most this far from the rest pose, root mean square, degrees; 0 makes one segment."""
     start: Literal["best", "previous", "skinned"] = "best"
     """Start of a frame: the frame before, the skinned pose, or whichever is nearer to the scan."""
     carry: float = 0.97
@@ -171,7 +174,7 @@ class QualityConfig:
     """99th percentile of edge stretch above which a frame has failed."""
     flipped_check_percent: float = 1.0
     """Share of faces against the scan's normals above which a frame is to be checked."""
-    intersections_check_percent: float = 2.0
+    intersections_check_percent: float = 10.0
     """Share of faces that cut another face above which a frame is to be checked."""
     min_covered_percent: float = 40.0
     """Share of vertices with scan data below which a frame has failed."""

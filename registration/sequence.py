@@ -1,16 +1,20 @@
 """A take, frame after frame: where each frame starts from, and what happens when one fails.
 
-With poses, every n-th frame is a keyframe. Keyframes are registered first, one from the other and with the cold schedule,
-so that sliding cannot build up frame by frame; then the frames between, each run of them from its keyframe. Runs need
-nothing from each other, go in parallel, and give the same result on any number of workers. A frame starts from the best
-of three predictions, measured by their distance to its scan:
+Frame by frame the cloth moves little and what it slides along the body can be followed; over larger steps it cannot. So
+frames are registered one from the other, in segments. A segment starts from a keyframe: a frame whose pose is so near
+the template's rest pose that the skinned template is a start as good as any (with the cold schedule). Segments need
+nothing from each other, run in parallel, and give the same result on any number of workers.
+
+Inside a segment there are three predictions of a frame:
 
     carried    the frame before, taken to the rest pose by inverse skinning and skinned to this frame's pose
     previous   the frame before as it is
     skinned    the template skinned to this frame's pose
 
-Where the blended skinning matrix is near singular the inverse means nothing, and the vertex keeps its template offset.
-Without poses each frame starts from the one before, and the first from the template as it lies.
+Sleeves follow the arms while a hem lags behind, so carried and previous are blended, node by node, by their distance to
+the scan. The start is the blend or the skinned template, whichever lies nearer. Where the blended skinning matrix is
+near singular its inverse means nothing, and the vertex keeps its template offset. Without poses each frame starts from
+the one before, and the first from the template as it lies.
 """
 
 from __future__ import annotations
@@ -18,6 +22,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -26,12 +31,16 @@ from jaxtyping import Float32, Float64
 from capture4d.body import ShapedBody, pose_frame, skin, unskin, with_shape
 from capture4d.errors import InputError
 from capture4d.types import Body, GarmentScan, PoseSequence
-from registration.config import RegistrationConfig
+from registration.config import RegistrationConfig, SequenceConfig
 from registration.quality import FrameQuality, assess
 from registration.register import FrameScan, prepare_frame, register_frame
 from registration.template import TemplateAnalysis
 
-__all__ = ["FrameResult", "Mover", "register_run", "runs_between_keyframes"]
+__all__ = ["FrameResult", "Mover", "register_run", "segments"]
+
+
+BLEND_FLOOR, BLEND_REACH = 0.001, 0.1
+"""Metres: below the floor two predictions fit equally well; beyond the reach one is as bad as another."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,6 +83,14 @@ class Mover:
         """The template in the pose of the index-th frame."""
         return skin(self.rest, self.skin_weights, pose_frame(self.shaped, self.poses, index).transforms)
 
+    def bend_deg(self) -> Float64[np.ndarray, " frames"]:
+        """How far each frame's joints are from the rest pose: root mean square angle under the garment, degrees."""
+        share = self.skin_weights.sum(axis=0).astype(np.float64)
+        share[0] = 0.0  # the root moves everything alike
+        trace = np.einsum("tjaa->tj", self.poses.rotations.astype(np.float64))
+        angle = np.degrees(np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0)))
+        return np.sqrt((share * angle**2).sum(axis=1) / max(float(share.sum()), 1e-12))
+
     def carried(
         self, vertices: Float32[np.ndarray, "verts 3"], before: int, index: int, share: float
     ) -> Float64[np.ndarray, "verts 3"]:
@@ -86,13 +103,25 @@ class Mover:
         return skin(self.rest + share * offset, self.skin_weights, transforms)
 
 
-def runs_between_keyframes(frames: int, *, spacing: int, posed: bool) -> tuple[range, list[range]]:
-    """The keyframes, and runs that each begin with one, as positions in the take.
+def segments(mover: Mover | None, frames: int, config: SequenceConfig) -> list[range]:
+    """The take cut at its keyframes, as positions; every segment begins with one.
 
-    Without poses nothing but the frame before can start a frame: one keyframe, one run.
+    A keyframe is the frame nearest to the rest pose among its neighbours, near enough for the skinned template, and at
+    least `config.segment` frames after the one before. Without poses there is one segment.
     """
-    step = spacing if posed else max(frames, 1)
-    return range(0, frames, step), [range(first, min(first + step, frames)) for first in range(0, frames, step)]
+    starts = [0]
+    if mover is not None:
+        bend = mover.bend_deg()
+        reach = max(config.segment // 4, 1)
+        for position in range(1, frames):
+            around = bend[max(position - reach, 0) : position + reach + 1]
+            if (
+                position - starts[-1] >= config.segment
+                and frames - position >= config.segment // 2
+                and bend[position] <= min(config.keyframe_bend_deg, float(around.min()))
+            ):
+                starts.append(position)
+    return [range(start, end) for start, end in pairwise([*starts, frames])]
 
 
 def register_run(
@@ -101,7 +130,6 @@ def register_run(
     positions: Sequence[int],
     frame_ids: Sequence[int],
     *,
-    keyframes: bool,
     load: Callable[[int], GarmentScan],
     done: Callable[[int], tuple[np.ndarray, bool] | None],
     config: RegistrationConfig,
@@ -111,7 +139,6 @@ def register_run(
     Args:
         positions: of the frames in the take, ascending.
         frame_ids: of the whole take.
-        keyframes: take the cold schedule for every frame.
         load: the garment scan of a frame; may raise InputError, which flags the frame.
         done: vertices of a frame that was finished earlier and whether they may be built upon, or None.
     """
@@ -122,7 +149,7 @@ def register_run(
         if earlier is not None:
             vertices, sound = earlier
         else:
-            result = _register_one(analysis, mover, frame_id, position, before, keyframes, load, config)
+            result = _register_one(analysis, mover, frame_id, position, before, load, config)
             yield result
             vertices, sound = result.vertices, result.quality.verdict != "failed"
         if sound:
@@ -135,7 +162,6 @@ def _register_one(
     frame_id: int,
     index: int,
     before: tuple[np.ndarray, int] | None,
-    keyframe: bool,
     load: Callable[[int], GarmentScan],
     config: RegistrationConfig,
 ) -> FrameResult:
@@ -144,7 +170,7 @@ def _register_one(
     name, start = next(iter(candidates.items()))
     try:
         scan = prepare_frame(analysis, load(frame_id), config)
-        name, start, schedule = _choose(analysis, scan, candidates, keyframe or before is None, config)
+        name, start, schedule = _choose(analysis, scan, candidates, before is None, config)
         fitted = register_frame(analysis, scan, start, config=config, schedule=schedule)
     except InputError as error:
         return FrameResult(
@@ -185,11 +211,31 @@ def _choose(
 ) -> tuple[str, np.ndarray, Literal["cold", "warm"]]:
     """The prediction nearest to the scan, and whether it is near enough for the warm schedule."""
     subset = analysis.coarse_vertices
-    misfit = {
-        name: float(np.median(scan.surface.tree.query(vertices[subset])[0])) for name, vertices in candidates.items()
-    }
-    name = min(misfit, key=lambda key: misfit[key])
-    return name, candidates[name], "cold" if distant or misfit[name] > config.sequence.cold_above else "warm"
+    misfits = {name: scan.surface.tree.query(vertices[subset])[0] for name, vertices in candidates.items()}
+    if "carried" in candidates and "previous" in candidates:
+        share = _share_of_carried(analysis, misfits["carried"], misfits["previous"])[:, None]
+        candidates["blended"] = share * candidates.pop("carried") + (1.0 - share) * candidates.pop("previous")
+        misfits["blended"] = scan.surface.tree.query(candidates["blended"][subset])[0]
+    median = {name: float(np.median(misfits[name])) for name in candidates}
+    name = min(median, key=lambda key: median[key])
+    return name, candidates[name], "cold" if distant or median[name] > config.sequence.cold_above else "warm"
+
+
+def _share_of_carried(analysis: TemplateAnalysis, carried: np.ndarray, previous: np.ndarray) -> np.ndarray:
+    """Weight (V,) of the carried prediction against the previous frame, smooth over the template.
+
+    Sleeves follow the arms, a hem lags behind a twist and slides: where a prediction is off, its distance to the scan
+    tells. The distances are averaged at the nodes of the deformation graph and spread to their vertices.
+    """
+    nodes, weights = analysis.graph.vertex_nodes, analysis.graph.vertex_weights
+    subset = analysis.coarse_vertices
+    squares = []
+    for misfit in (carried, previous):
+        spread = weights[subset] * (np.minimum(misfit, BLEND_REACH)[:, None] ** 2 + BLEND_FLOOR**2)
+        total = np.bincount(nodes[subset].reshape(-1), spread.reshape(-1), minlength=len(analysis.graph.nodes))
+        squares.append(total)
+    share = squares[1] / np.maximum(squares[0] + squares[1], 1e-30)
+    return np.einsum("vk,vk->v", weights, share[nodes])
 
 
 def _failure(count: int, reason: str) -> FrameQuality:

@@ -35,7 +35,7 @@ from capture4d.workdir import (
     write_npz,
 )
 from registration.config import RegistrationConfig
-from registration.sequence import FrameResult, Mover, register_run, runs_between_keyframes
+from registration.sequence import FrameResult, Mover, register_run, segments
 from registration.template import TemplateAnalysis, analyse_template
 
 __all__ = ["load_registration", "run"]
@@ -45,14 +45,13 @@ VERDICTS = ("good", "check", "failed")
 
 
 @dataclass(frozen=True, slots=True)
-class RunJob:
-    """Frames for one worker, each starting from the one before."""
+class SegmentJob:
+    """A segment of the take for one worker."""
 
     capture: Path
     garment_folder: Path
     stage: Stage
     positions: range
-    keyframes: bool
 
 
 def run(
@@ -82,19 +81,17 @@ def run(
         save_garment(output / "garment.npz", garment)
     mover = Mover.create(_analysis(capture, config), read_body(description), read_poses(description))
     frame_ids = description.frame_ids
-    keyframes, runs = runs_between_keyframes(
-        len(frame_ids), spacing=config.sequence.keyframe_spacing, posed=mover is not None
-    )
-    jobs = [RunJob(capture, garment_folder, stage, keyframes, True)]
-    for label in ("register keyframes", "register"):
-        pending = set(stage.pending(frame_ids))
-        left = [job for job in jobs if pending.intersection(frame_ids[position] for position in job.positions)]
-        for _ in run_jobs(
-            partial(_register_job, config), left, workers=workers, label=label, units=lambda job: len(job.positions),
-            finished=lambda: len(frame_ids) - len(stage.pending(frame_ids)),
-        ):  # fmt: skip
-            pass
-        jobs = [RunJob(capture, garment_folder, stage, positions, False) for positions in runs]
+    pending = set(stage.pending(frame_ids))
+    jobs = [
+        SegmentJob(capture, garment_folder, stage, positions)
+        for positions in segments(mover, len(frame_ids), config.sequence)
+        if pending.intersection(frame_ids[position] for position in positions)
+    ]
+    for _ in run_jobs(
+        partial(_register_job, config), jobs, workers=workers, label="register", units=lambda job: len(job.positions),
+        finished=lambda: len(frame_ids) - len(stage.pending(frame_ids)),
+    ):  # fmt: skip
+        pass
     return _collect(stage, description.frame_ids)
 
 
@@ -116,7 +113,7 @@ def _analysis(capture: Path, config: RegistrationConfig) -> TemplateAnalysis:
     return analyse_template(read_template(read_capture(capture)), config)
 
 
-def _register_job(config: RegistrationConfig, job: RunJob) -> int:
+def _register_job(config: RegistrationConfig, job: SegmentJob) -> int:
     """Register and write the frames of a run; how many were new."""
     description = read_capture(job.capture)
     frame_ids = description.frame_ids
@@ -135,7 +132,6 @@ def _register_job(config: RegistrationConfig, job: RunJob) -> int:
         mover,
         job.positions,
         frame_ids,
-        keyframes=job.keyframes,
         load=lambda frame_id: load_garment_scan(job.garment_folder / "frames" / f"{frame_id:06d}.npz", frame_id),
         done=done,
         config=config,
