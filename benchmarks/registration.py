@@ -105,6 +105,7 @@ def run(
     frames: int = 120,
     compared: int = 6,
     workers: int = 2,
+    capture: Path | None = None,
 ) -> list[Metric]:
     """Register a take, and single frames of it with every method.
 
@@ -114,16 +115,17 @@ def run(
         frames: of the take (synth).
         compared: frames on which all methods start from the same place.
         workers: processes that make the take; registration itself is measured in one.
+        capture: capture folder with truth to measure on instead of the cached synthetic take.
     """
     if data == "faces":
         return _faces(2 if quick else len(FACES))
     with tempfile.TemporaryDirectory(prefix="capture4d-registration-") as scratch:
         if data == "diffcloth":
-            capture = _scanned_diffcloth(Path(scratch) / "capture", 4 if quick else 13, workers)
-            return _take(capture, Path(scratch), 3 if quick else compared, start="previous")
-        take = read_capture(_synthetic_take(quick, workers))
-        capture = _first_frames(take, Path(scratch) / "capture", frames)
-        return _take(capture, Path(scratch), 2 if quick else compared, start="skinned")
+            scans = _scanned_diffcloth(Path(scratch) / "capture", 4 if quick else 13, workers)
+            return _take(scans, Path(scratch), 3 if quick else compared, start="previous")
+        take = read_capture(capture or _synthetic_take(quick, workers))
+        first = _first_frames(take, Path(scratch) / "capture", frames)
+        return _take(first, Path(scratch), 2 if quick else compared, start="skinned")
 
 
 def _synthetic_take(quick: bool, workers: int) -> Path:

@@ -40,7 +40,7 @@ MIN_PART = 0.005
 """Parts with a smaller share of the garment's faces are dropped."""
 FAR_SIDE = 0.6
 """A border point is at least this share of the band's width away from garment colour."""
-EROSION = 1.2
+EROSION = 0.9
 """Sample spacings by which fused scans stop short of an open border (measured against the synthetic scanner)."""
 EVEN_BAND = 2.0
 """A band counts as even if its widths (20 to 90 %) differ by less than this many sample spacings."""
@@ -190,7 +190,7 @@ def _border_points(mesh: Mesh, labels: np.ndarray, paints: int) -> tuple[np.ndar
         narrow, full = np.percentile(width_here[own], (20, 90))
         missing = np.full(len(own), EROSION * spacing)
         if full - narrow < EVEN_BAND * spacing:
-            missing = np.clip(full + 0.5 * spacing - width_here[own], 0.0, 2.5 * spacing)
+            missing = np.clip(full + 0.2 * spacing - width_here[own], 0.0, 2.5 * spacing)
         direction = across[own] / width_here[own, None]
         points.append((outer[own] + missing[:, None] * direction).astype(np.float32))
         labels_of.append(np.full(len(own), paint, labels.dtype))
