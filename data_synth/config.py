@@ -43,8 +43,9 @@ class Fabric:
     name: str = "jersey"
     density: float = 0.2
     """Mass of an area, kg/m2."""
-    stretch_stiffness: float = 1e3
-    """Membrane stiffness of the coarse sheet, N/m."""
+    stretch_stiffness: float = 200.0
+    """Membrane stiffness of the coarse sheet, N/m. Its own weight stretches a shirt by half a percent at 200; at 1000
+    the solver is so far from converged that the hem hangs 26 mm too low."""
     coarse_bending: float = 2e-5
     """Bending stiffness of the coarse sheet, N m."""
     friction: float = 0.25
@@ -69,17 +70,19 @@ class SimulationConfig:
     vertices: int = 5000
     """Vertices of the simulated sheet."""
     fps: float = 60.0
-    substeps: int = 5
-    iterations: int = 8
-    """Vertex block descent sweeps a substep; raise both for finer sheets, which converge more slowly."""
-    calm_frames: int = 20
+    substeps: int = 16
+    """Steps a frame. Many short ones converge far better than many iterations: at equal cost the hem of 10 x 4
+    hangs 18 mm higher than that of 5 x 8."""
+    iterations: int = 3
+    """Vertex block descent sweeps a substep."""
+    calm_frames: int = 18
     """Frames in the dressing pose in which the panels close on the body."""
-    approach_frames: int = 30
+    approach_frames: int = 24
     """Frames from the dressing pose to the clip's first pose."""
-    rest_frames: int = 20
+    rest_frames: int = 14
     """Frames at rest before the clip starts."""
     contact_gap_m: float = 0.008
-    damping: float = 0.998
+    damping: float = 0.9994
     """Share of the velocity kept each substep."""
     calm_damping: float = 0.85
 
@@ -137,14 +140,14 @@ class SynthConfig:
     scanner: ScannerConfig = field(default_factory=ScannerConfig)
 
 
-_FULL = SynthConfig(name="tshirt-200k", frames=150)
+_FULL = SynthConfig(name="tshirt-200k")
 PRESETS: dict[str, SynthConfig] = {
     "demo": replace(
         _FULL,
         name="demo",
         frames=36,
         capture_every=3,
-        simulation=SimulationConfig(calm_frames=16, approach_frames=18, rest_frames=10),
+        simulation=SimulationConfig(calm_frames=14, approach_frames=16, rest_frames=8),
     ),
     "tiny": replace(
         _FULL,
@@ -152,7 +155,7 @@ PRESETS: dict[str, SynthConfig] = {
         frames=6,
         capture_every=4,
         template_vertices=1500,
-        simulation=SimulationConfig(vertices=1600, calm_frames=12, approach_frames=10, rest_frames=4),
+        simulation=SimulationConfig(vertices=1600, substeps=8, calm_frames=14, approach_frames=12, rest_frames=6),
         relaxation=RelaxationConfig(vertices=12_000, sweeps=40),
         scanner=ScannerConfig(rig=RigConfig(cameras=20, image_size=320)),
     ),

@@ -73,7 +73,7 @@ def dress(shaped: ShapedBody, mesh: PanelMesh, pattern: Pattern, first: PosedBod
     names = shaped.body.joint_names
     shoulder = shaped.joints[names.index("upperarm01.L")]
     trunk = surface[(np.abs(surface[:, 0]) < 0.12) & (np.abs(surface[:, 1] - shoulder[1] + 0.15) < 0.25)]
-    middle_z, depth = np.mean([trunk[:, 2].min(), trunk[:, 2].max()]), np.ptp(trunk[:, 2]) / 2 + 0.06
+    middle_z, depth = np.mean([trunk[:, 2].min(), trunk[:, 2].max()]), np.ptp(trunk[:, 2]) / 2 + 0.04
     names_of_panels, origins = zip(*((panel.name, panel.origin) for panel in pattern.panels), strict=True)
     panel = np.array(names_of_panels)[mesh.face_panels[mesh.vertex_faces]]
     draft = mesh.vertex_uv - np.array(origins)[mesh.face_panels[mesh.vertex_faces]]

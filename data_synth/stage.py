@@ -44,7 +44,7 @@ GARMENT_COLOUR, BORDER_COLOUR = (47, 98, 201), (255, 196, 0)
 SUIT_COLOUR, SKIN_COLOUR = (150, 152, 156), (214, 168, 140)
 BORDER_BAND_M = 0.009
 """Width of the painted border."""
-RIG_RADIUS_M = 0.62
+RIG_RADIUS_M = 0.58
 """Smallest sphere the rig is set up for: the upper body with room for the garment."""
 
 
