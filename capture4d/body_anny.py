@@ -21,6 +21,7 @@ from capture4d.cache import user_cache_folder
 from capture4d.mesh import connected_components, face_areas
 from capture4d.scans import load_body, save_body
 from capture4d.types import Body, Mesh
+from capture4d.warp_loading import import_warp
 
 __all__ = ["load_anny"]
 
@@ -43,11 +44,9 @@ def load_anny() -> Body:
 
 def _bake(scratch: Path) -> Body:
     os.environ["ANNY_CACHE_DIR"] = str(scratch)
-    import torch
-    import warp
-
-    warp.config.log_level = warp.LOG_ERROR  # before anny loads: warp announces devices and compiled modules
+    import_warp()
     import anny
+    import torch
 
     model = anny.Anny().to(dtype=torch.float32)
     rng = np.random.default_rng(0)

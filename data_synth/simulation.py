@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from capture4d.body import PosedBody, ShapedBody, with_pose
 from capture4d.open3d_loading import import_open3d
 from capture4d.types import PoseSequence
+from capture4d.warp_loading import import_warp
 from data_synth.config import Fabric, SimulationConfig
 from data_synth.patterns import PanelMesh, Pattern
 
@@ -140,9 +141,7 @@ def simulate(
     Yields:
         Cloth vertices (V, 3) float64 for each frame, the first included.
     """
-    import warp
-
-    warp.config.log_level = warp.LOG_ERROR  # before newton loads: it announces devices and compiled modules
+    import_warp()
     import newton
 
     model, body = _build_model(mesh, start, bodies, fabric)
@@ -176,8 +175,8 @@ def simulate(
 def _build_model(mesh: PanelMesh, start: np.ndarray, bodies: Sequence[PosedBody], fabric: Fabric) -> tuple[Any, Any]:
     """newton's model of cloth and collider, and the collider whose points each substep moves."""
     import newton
-    import warp as wp
 
+    wp = import_warp()
     builder = newton.ModelBuilder(up_axis=newton.Axis.Y)
     builder.add_cloth_mesh(
         pos=wp.vec3(0.0, 0.0, 0.0),
