@@ -171,7 +171,6 @@ def _take(folder: Path, scratch: Path, compared: int, *, start: Literal["skinned
     whole = [_score(garment, case, load(capture.frame_ids[row]), 0.0) for row, case in enumerate(cases(None))]
     take = _mean(whole)
     warm = [record["cpu_s"] for record in records if "warm" in record["started_from"]]
-    cold = [record["cpu_s"] for record in records[1:] if "cold" in record["started_from"]]
     metrics = [
         Metric("truth_distance_mean_mm", take.truth_distance_mean_mm, "mm"),
         Metric("truth_distance_p95_mm", take.truth_distance_p95_mm, "mm"),
@@ -182,7 +181,6 @@ def _take(folder: Path, scratch: Path, compared: int, *, start: Literal["skinned
         Metric("correspondence_p95_mm", take.correspondence_p95_mm, "mm"),
         Metric("drift_ratio", drift_ratio(np.array([scores.correspondence_mean_mm for scores in whole]))),
         Metric("warm_cpu_s", _median(warm), "s"),
-        Metric("cold_cpu_s", _median(cold), "s"),
         Metric("peak_rss_mb", peak_mb, "MB"),
         Metric("rss_growth_mb", peak_mb - short_mb, "MB"),
         Metric("failed_frames", float(sum(record["verdict"] == "failed" for record in records))),
@@ -252,7 +250,7 @@ def _comparison(garment: Garment, cases: Sequence[Case], warm_cpu_s: float) -> l
 
 
 def _comparison_metrics(scores: Mapping[str, Scores], warm_cpu_s: float) -> list[Metric]:
-    metrics = []
+    metrics = [Metric("cold_cpu_s", scores["default"].cpu_s, "s")]
     for name, score in scores.items():
         for key in Scores.__dataclass_fields__:
             metrics.append(Metric(f"{name}_{key}", getattr(score, key), "s" if key == "cpu_s" else "mm"))

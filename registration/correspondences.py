@@ -19,6 +19,10 @@ from capture4d.mesh_kernels import laplacian_pass, open_vertices, vertex_normals
 __all__ = ["Matches", "ScanSurface", "match", "match_both_ways", "mesh_normals", "prepare_scan"]
 
 
+SECOND_LAYER = 12
+"""How many scan vertices are looked through for one on the right layer."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanSurface:
     """A scan ready to be matched against."""
@@ -88,6 +92,9 @@ def match(
 ) -> Matches:
     """Nearest scan vertex of each point, gated in distance and normal, with Geman-McClure weights.
 
+    A point whose nearest scan vertex looks another way, as on two layers of cloth, takes the nearest of the next few
+    that does not.
+
     Args:
         gate: largest distance, metres.
         robust_scale: scale of the weight (1 + (d/s)^2)^-2 as a share of the gate, d measured along the scan's normal.
@@ -95,12 +102,25 @@ def match(
     distances, indices = surface.tree.query(points, distance_upper_bound=gate)
     found = indices < len(surface.points)
     nearest = np.where(found, indices, 0)
+    cosine = np.einsum("va,va->v", normals, surface.normals[nearest])
+    turned = np.flatnonzero(found & (cosine < min_normal_cosine))
+    if len(turned):
+        further, others = surface.tree.query(points[turned], k=SECOND_LAYER, distance_upper_bound=gate)
+        there = np.isfinite(further)
+        others = np.where(there, others, 0)
+        other_cosine = np.einsum("va,vka->vk", normals[turned], surface.normals[others])
+        fits = there & (other_cosine >= min_normal_cosine)
+        first, rows = np.argmax(fits, axis=1), np.arange(len(turned))
+        better = fits.any(axis=1)
+        changed = turned[better]
+        nearest[changed] = others[rows, first][better]
+        distances[changed] = further[rows, first][better]
+        cosine[changed] = other_cosine[rows, first][better]
     target, target_normal = surface.points[nearest], surface.normals[nearest]
-    cosine = np.einsum("va,va->v", normals, target_normal)
     off_plane = np.einsum("va,va->v", points - target, target_normal)
     weights = 1.0 / (1.0 + (off_plane / (robust_scale * gate)) ** 2) ** 2
     weights[~found | (cosine < min_normal_cosine)] = 0.0
-    return Matches(target, target_normal, weights, distances, indices)
+    return Matches(target, target_normal, weights, distances, np.where(found, nearest, len(surface.points)))
 
 
 def match_both_ways(

@@ -33,7 +33,10 @@ def tangential_metric(
 
 
 def rigid_term(nodes: Float64[np.ndarray, "nodes 3 4"], *, weight: float, spacing: float) -> BlockTerm:
-    """E_rigid of embedded deformation: (a1.a2)^2 + (a1.a3)^2 + (a2.a3)^2 + sum_c (1 - a_c.a_c)^2 over the columns of A.
+    """E_rigid of embedded deformation: |A^T A - I|^2, over the columns of A the six products that a rotation fixes.
+
+    Sumner et al. 2007 count each of the three mixed products once, which makes the energy depend on the axes of the
+    world; both of its places in A^T A are counted here.
 
     Args:
         weight: of the mean over nodes, after multiplication by `spacing` squared.
@@ -93,6 +96,9 @@ def rigid_kernel(nodes, weight):
                 jacobian[row, 4 * i + c] += a[i, d]
                 jacobian[row, 4 * i + d] += a[i, c]
             residual[row] = product - (1.0 if c == d else 0.0)
+            if c != d:
+                residual[row] *= np.sqrt(2.0)
+                jacobian[row] *= np.sqrt(2.0)
         for row in range(6):
             for i in range(12):
                 ji = jacobian[row, i]

@@ -91,7 +91,7 @@ def register_frame(
     return FrameRegistration(vertices, schedule, first + second)
 
 
-def _anneal(pair: tuple[float, float], step: int, steps: int) -> float:
+def anneal(pair: tuple[float, float], step: int, steps: int) -> float:
     """Geometric interpolation from first to last; linear if either end is 0."""
     first, last = pair
     share = step / max(steps - 1, 1)
@@ -121,25 +121,25 @@ def _coarse_stage(
     for step in range(schedule.steps):
         at = (step, schedule.steps)
         normals = mesh_normals(vertices, analysis.faces)[subset]
-        terms = [_data_term(data_rows, scan.surface, vertices[subset], normals, _anneal(schedule.gate, *at), config)]
+        terms = [_data_term(data_rows, scan.surface, vertices[subset], normals, anneal(schedule.gate, *at), config)]
         if step == 0 and not terms[0].metric.any():
             raise InputError(
                 f"frame {scan.frame_id}: expected scan vertices within {schedule.gate[0]:g} m of the start, found none"
             )
         terms += _border_terms(
             analysis, border_rows, scan, vertices, config.boundary.coarse_rule, False,
-            _anneal(schedule.boundary, *at), config,
+            anneal(schedule.boundary, *at), config,
         )  # fmt: skip
-        smooth = _anneal(schedule.smooth, *at) / max(len(node_constant), 1)
+        smooth = anneal(schedule.smooth, *at) / max(len(node_constant), 1)
         metric = np.broadcast_to(smooth * np.eye(3), (len(node_constant), 3, 3))
         terms.append(RowTerm(node_rows, np.ascontiguousarray(metric), node_rows.apply(nodes) + node_constant))
-        stretch = _anneal(schedule.stretch, *at)
+        stretch = anneal(schedule.stretch, *at)
         if stretch > 0.0:
             metric, excess = stretch_metric(
                 pair_start + pair_rows.apply(nodes), pair_rest, weight=stretch, compression=config.dense.compression
             )
             terms.append(RowTerm(pair_rows, metric, excess))
-        rigid = rigid_term(nodes, weight=_anneal(schedule.rigid, *at), spacing=graph.spacing)
+        rigid = rigid_term(nodes, weight=anneal(schedule.rigid, *at), spacing=graph.spacing)
         change, used = gauss_newton_step(
             terms, rigid, count, damping=1e-6,
             tolerance=config.solver.tolerance, max_iterations=config.solver.max_iterations,
@@ -169,23 +169,23 @@ def _dense_stage(
     for step in range(schedule.steps):
         at = (step, schedule.steps)
         normals = mesh_normals(vertices, analysis.faces)
-        gate = _anneal(schedule.gate, *at)
+        gate = anneal(schedule.gate, *at)
         terms = [_data_term(analysis.vertex_rows, scan.surface, vertices, normals, gate, config)]
         terms += _border_terms(
             analysis, border_rows, scan, vertices, config.boundary.dense_rule, config.boundary.along_curve,
-            _anneal(schedule.boundary, *at), config,
+            anneal(schedule.boundary, *at), config,
         )  # fmt: skip
         stretch, excess = stretch_metric(
             edge_vectors(vertices, analysis.edges), analysis.rest_lengths,
-            weight=_anneal(schedule.stretch, *at), compression=config.dense.compression,
+            weight=anneal(schedule.stretch, *at), compression=config.dense.compression,
         )  # fmt: skip
         terms.append(RowTerm(analysis.edge_rows, stretch, excess))
         bending = analysis.laplacian_rows.apply(vertices[:, :, None]) - reference
         smooth = np.ascontiguousarray(
-            np.broadcast_to(_anneal(schedule.smooth, *at) / count * np.eye(3), (count, 3, 3))
+            np.broadcast_to(anneal(schedule.smooth, *at) / count * np.eye(3), (count, 3, 3))
         )
         terms.append(RowTerm(analysis.laplacian_rows, smooth, (1.0 - config.dense.plasticity) * bending))
-        anchor = _anneal(schedule.anchor, *at)
+        anchor = anneal(schedule.anchor, *at)
         if anchor > 0.0:
             weights = np.full(count, anchor / count)
             terms.append(RowTerm(analysis.vertex_rows, tangential_metric(normals, weights), vertices - start))

@@ -1,0 +1,98 @@
+"""A painted tube on a grey body: cut out by colour under uneven light, its border found behind holes."""
+
+import numpy as np
+import pytest
+
+from capture4d.errors import InputError
+from capture4d.garment_extraction import ColourNotFoundError, classify_colours, extract_garment
+from capture4d.types import Mesh, Scan
+
+CLOTH, TOP, BOTTOM, SUIT = (47, 98, 201), (255, 196, 0), (229, 51, 42), (150, 152, 156)
+AROUND, ALONG, BAND = 200, 120, 0.012
+
+
+def painted_tube(rng: np.random.Generator, *, holes: int = 0, bottom: tuple[int, int, int] = BOTTOM) -> Scan:
+    """A tube 0.3 m high with 12 mm of paint at either end, going on as a grey suit beyond its lower border."""
+    angle = 2 * np.pi * np.arange(AROUND) / AROUND
+    heights = np.linspace(-0.1, 0.3, ALONG)
+    ring = np.stack([0.1 * np.sin(angle), 0.1 * np.cos(angle)], axis=1)
+    vertices = np.concatenate([np.column_stack([ring[:, 0], np.full(AROUND, y), ring[:, 1]]) for y in heights])
+    column, row = np.meshgrid(np.arange(AROUND), np.arange(ALONG - 1))
+    a, b = row * AROUND + column, row * AROUND + (column + 1) % AROUND
+    faces = np.concatenate(
+        [np.stack([a, b, b + AROUND], -1).reshape(-1, 3), np.stack([a, b + AROUND, a + AROUND], -1).reshape(-1, 3)]
+    )
+    y = vertices[:, 1]
+    colours = np.full((len(vertices), 3), SUIT, float)
+    colours[y >= 0] = CLOTH
+    colours[(y >= 0) & (y < BAND)] = bottom
+    colours[y > 0.3 - BAND] = TOP
+    light = 0.55 + 0.45 * np.clip(vertices[:, 2:] / 0.1, -1, 1)  # from nearly dark to full
+    colours = np.clip(255 * (((colours / 255) ** 2.2) * np.maximum(light, 0.25)) ** (1 / 2.2), 0, 255)
+    colours += 4 * rng.standard_normal(colours.shape)
+    keep = np.ones(len(faces), bool)
+    for _ in range(holes):
+        centre = np.array([*ring[rng.integers(AROUND)], 0])[[0, 2, 1]] + [0, rng.uniform(0, 0.02), 0]
+        keep &= np.linalg.norm(vertices[faces].mean(axis=1) - centre, axis=1) > 0.006
+    mesh = Mesh(vertices.astype(np.float32), faces[keep].astype(np.int32))
+    return Scan(mesh, np.clip(colours, 0, 255).astype(np.uint8), 3, 0.0)
+
+
+def test_the_garment_is_cut_out_whole() -> None:
+    scan = painted_tube(np.random.default_rng(0))
+    found = extract_garment(scan, CLOTH, {"top": TOP, "bottom": BOTTOM})
+    expected = scan.mesh.vertices[scan.mesh.vertices[:, 1] >= 0]
+    assert len(found.mesh.vertices) == pytest.approx(len(expected), rel=0.01)
+    assert found.mesh.vertices[:, 1].min() > -0.007
+
+
+@pytest.mark.parametrize("holes", [0, 25])
+def test_border_points_lie_on_the_border(holes: int) -> None:
+    found = extract_garment(painted_tube(np.random.default_rng(1), holes=holes), CLOTH, {"top": TOP, "bottom": BOTTOM})
+    height = found.boundary_points[:, 1]
+    top, bottom = found.boundary_loops == 0, found.boundary_loops == 1
+    assert top.sum() > 150
+    assert bottom.sum() > 120
+    assert np.abs(height[top] - 0.3).mean() < 0.004
+    assert np.abs(height[bottom]).mean() < 0.004
+    assert np.percentile(np.abs(height[bottom]), 95) < 0.007
+
+
+def test_one_paint_cannot_tell_loops_apart() -> None:
+    found = extract_garment(painted_tube(np.random.default_rng(2), bottom=TOP), CLOTH, {"top": TOP, "bottom": TOP})
+    assert found.loop_names == ("top", "bottom")
+    assert (found.boundary_loops == -1).all()
+
+
+def test_specks_are_cleaned_and_other_parts_dropped() -> None:
+    rng = np.random.default_rng(3)
+    scan = painted_tube(rng)
+    colours = scan.colours.copy()
+    specks = rng.choice(np.flatnonzero(scan.mesh.vertices[:, 1] > 0.05), 60, replace=False)
+    colours[specks] = SUIT
+    hand = scan.mesh.vertices[:, 1] < -0.08
+    colours[hand] = TOP
+    found = extract_garment(Scan(scan.mesh, colours, 3, 0.0), CLOTH, {"top": TOP, "bottom": BOTTOM})
+    assert found.mesh.vertices[:, 1].min() > -0.007
+    clean = extract_garment(scan, CLOTH, {"top": TOP, "bottom": BOTTOM})
+    assert len(found.mesh.faces) > 0.99 * len(clean.mesh.faces)
+
+
+def test_shading_does_not_change_the_class() -> None:
+    shades = (np.array([CLOTH, TOP, BOTTOM, SUIT])[:, None] * np.linspace(0.5, 1, 8)[:, None]).reshape(-1, 3)
+    labels = classify_colours(shades.astype(np.uint8), CLOTH, (TOP, BOTTOM)).reshape(4, 8)
+    np.testing.assert_array_equal(labels, np.repeat([[1], [2], [3], [0]], 8, axis=1))
+
+
+def test_missing_colours_are_named_with_what_was_found() -> None:
+    scan = painted_tube(np.random.default_rng(4))
+    with pytest.raises(ColourNotFoundError, match=r"scans/3.ply: garment colour #00ff00 not found: .* found 0 %"):
+        extract_garment(scan, (0, 255, 0), {"top": TOP}, source="scans/3.ply")
+    with pytest.raises(InputError, match=r"border colour #ff00ff not found: expected at least 0.1 %"):
+        extract_garment(scan, CLOTH, {"top": (255, 0, 255)})
+
+
+def test_no_painted_borders_no_border_points() -> None:
+    found = extract_garment(painted_tube(np.random.default_rng(5)), CLOTH, {})
+    assert len(found.boundary_points) == 0
+    assert len(found.mesh.faces) > 0

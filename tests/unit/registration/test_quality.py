@@ -1,0 +1,86 @@
+"""Measures of a frame against brute force, and verdicts with reasons."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from registration.config import QualityConfig
+from registration.quality import assess, border_distances, count_intersecting_faces
+from registration.register import prepare_frame
+from registration.template import analyse_template
+
+
+def straight_through(points: np.ndarray) -> np.ndarray:
+    return points
+
+
+def test_a_perfect_frame_is_good(garment, scan_of, config) -> None:
+    analysis = analyse_template(garment, config)
+    frame = prepare_frame(analysis, scan_of(straight_through, around=216, along=103), config)
+    quality = assess(analysis, frame, analysis.rest, QualityConfig())
+    assert quality.verdict == "good"
+    assert not quality.reasons
+    assert quality.numbers["fit_mean_mm"] < 0.3
+    assert quality.numbers["boundary_mean_mm"] < 1.5
+    assert quality.numbers["stretch_p99"] == 1.0
+    assert quality.numbers["flipped_faces"] == quality.numbers["self_intersections"] == 0
+    assert quality.numbers["covered_percent"] == 100
+
+
+def test_an_offset_is_measured_and_named(garment, scan_of, config) -> None:
+    analysis = analyse_template(garment, config)
+    frame = prepare_frame(analysis, scan_of(straight_through), config)
+    grown = analysis.rest * [1.05, 1.0, 1.05]
+    quality = assess(analysis, frame, grown, QualityConfig())
+    assert quality.verdict == "failed"
+    assert any(reason.startswith("fit_mean_mm") for reason in quality.reasons)
+    assert 5 < quality.numbers["fit_mean_mm"] < 10
+
+
+def test_holes_have_no_residual(garment, scan_of, config) -> None:
+    scan = scan_of(straight_through)
+    kept = scan.mesh.vertices[scan.mesh.faces].mean(axis=1)[:, 0] < 0.05
+    holed = replace(scan, mesh=replace(scan.mesh, faces=scan.mesh.faces[kept]))
+    analysis = analyse_template(garment, config)
+    quality = assess(analysis, prepare_frame(analysis, holed, config), analysis.rest, QualityConfig())
+    beyond = analysis.rest[:, 0] > 0.08
+    assert np.isnan(quality.residual_m[beyond]).all()
+    assert np.isfinite(quality.residual_m[analysis.rest[:, 0] < 0.04]).all()
+
+
+def test_inside_out_is_noticed(garment, scan_of, config) -> None:
+    analysis = analyse_template(garment, config)
+    scan = scan_of(straight_through)
+    turned = replace(scan, mesh=replace(scan.mesh, faces=scan.mesh.faces[:, ::-1].copy()))
+    quality = assess(analysis, prepare_frame(analysis, turned, config), analysis.rest, QualityConfig())
+    assert quality.numbers["flipped_faces"] == len(analysis.faces)
+    assert quality.verdict == "check"
+
+
+def test_border_distances_go_both_ways(garment, scan_of, config) -> None:
+    analysis = analyse_template(garment, config)
+    frame = prepare_frame(analysis, scan_of(lambda p: p + [0, 0.004, 0]), config)
+    distances = border_distances(analysis, frame, analysis.rest)
+    np.testing.assert_allclose(np.median(distances), 0.004, atol=5e-4)
+    assert len(distances) > len(analysis.border.vertices)
+
+
+def test_intersections_equal_brute_force() -> None:
+    """Random triangles: an edge of one passes through the other, by solving for the crossing."""
+    rng = np.random.default_rng(0)
+    count = 60
+    vertices = (rng.random((count, 1, 3)) + 0.25 * rng.standard_normal((count, 3, 3))).reshape(-1, 3)
+    faces = np.arange(3 * count, dtype=np.int32).reshape(-1, 3)
+
+    def pierces(face: int, other: int) -> bool:
+        a, b, c = vertices[faces[other]]
+        for i in range(3):
+            start, end = vertices[faces[face, i]], vertices[faces[face, (i + 1) % 3]]
+            t, u, v = np.linalg.solve(np.column_stack([start - end, b - a, c - a]), start - a)
+            if 0 <= t <= 1 and u >= 0 and v >= 0 and u + v <= 1:
+                return True
+        return False
+
+    cut = {f for f in range(count) for g in range(count) if f != g and (pierces(f, g) or pierces(g, f))}
+    assert 5 < len(cut) < count
+    assert count_intersecting_faces(vertices, faces) == len(cut)

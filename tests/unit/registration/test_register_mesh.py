@@ -1,0 +1,108 @@
+"""Any template on any scan: units, order, borders, refusals."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from capture4d.errors import InputError
+from capture4d.mesh_files import read_mesh, write_mesh
+from capture4d.types import Mesh
+from registration.config import SOFT, MeshRegistrationConfig, Schedule
+from registration.register_mesh import guess_units, register_mesh, run
+
+PAINT = (255, 210, 0)
+
+
+@pytest.fixture
+def quick() -> MeshRegistrationConfig:
+    soft = replace(
+        SOFT,
+        graph=replace(SOFT.graph, nodes=40),
+        coarse=replace(SOFT.coarse, cold=replace(SOFT.coarse.cold, steps=12)),
+        dense=replace(SOFT.dense, cold=replace(SOFT.dense.cold, steps=8)),
+    )
+    return MeshRegistrationConfig(registration=soft)
+
+
+def swell(points: np.ndarray) -> np.ndarray:
+    return points * [1.1, 1.04, 1.0] + np.column_stack([0.02 * np.sin(8 * points[:, 1]), 0 * points[:, :2]])
+
+
+def scaled(mesh: Mesh, factor: float) -> Mesh:
+    return mesh.with_vertices((factor * mesh.vertices).astype(np.float32))
+
+
+def test_millimetres_and_metres_give_the_same_result(garment, scan_of, quick) -> None:
+    template, scan = garment.template, scan_of(swell).mesh
+    metres = register_mesh(template, scan, config=quick)
+    millimetres = register_mesh(scaled(template, 1000), scaled(scan, 1000), config=quick)
+    change = np.linalg.norm(millimetres.vertices / 1000 - metres.vertices, axis=1)
+    moved = np.linalg.norm(metres.vertices - template.vertices, axis=1)
+    assert change.mean() < 0.01 * moved.mean()
+    for key in ("fit_mean_mm", "scan_fit_mean_mm"):
+        assert millimetres.quality.numbers[key] == pytest.approx(metres.quality.numbers[key], rel=0.01)
+
+
+def test_the_template_keeps_its_order_and_faces(garment, scan_of, quick, tmp_path: Path) -> None:
+    write_mesh(tmp_path / "template.obj", garment.template)
+    write_mesh(tmp_path / "scan.ply", scan_of(swell).mesh)
+    run(tmp_path / "template.obj", tmp_path / "scan.ply", tmp_path / "out.ply", quick)
+    mesh = read_mesh(tmp_path / "out.ply").mesh
+    np.testing.assert_array_equal(mesh.faces, garment.template.faces)
+    truth = swell(garment.template.vertices.astype(float))
+    assert np.linalg.norm(mesh.vertices - truth, axis=1).mean() < 0.01
+    record = json.loads((tmp_path / "out.json").read_text())
+    assert record["units"] == "m"
+    assert record["cpu_s"] > 0
+    assert record["fit_mean_mm"] < 1
+    assert record["boundary_mean_mm"] is None
+
+
+def test_painted_borders_are_measured(garment, scan_of, quick) -> None:
+    scan = scan_of(swell).mesh
+    colours = np.tile(np.array([[47, 98, 201]], np.uint8), (len(scan.vertices), 1))
+    height = np.linspace(0, 1, 80)[:, None] * np.ones(160)
+    colours[(height.reshape(-1) < 0.03) | (height.reshape(-1) > 0.97)] = PAINT
+    result = register_mesh(
+        garment.template, scan, colours=colours, config=replace(quick, boundary_colour="ffd200", units="m")
+    )
+    assert result.quality.numbers["boundary_mean_mm"] < 4
+
+
+def test_alignment_comes_first_when_asked_for(garment, scan_of, quick) -> None:
+    scan = scan_of(swell).mesh
+    away = scan.with_vertices((scan.vertices + np.array([2.0, 0, 0])).astype(np.float32))
+    with pytest.raises(InputError, match="expected scan vertices within"):
+        register_mesh(garment.template, away, config=quick)
+    result = register_mesh(garment.template, away, config=replace(quick, align="rigid"))
+    assert result.quality.numbers["fit_mean_mm"] < 1
+
+
+def test_refusals(garment, scan_of, quick) -> None:
+    template, scan = garment.template, scan_of(swell).mesh
+    painted = replace(quick, boundary_colour="ffd200")
+    with pytest.raises(InputError, match=r"scan: expected a colour per vertex"):
+        register_mesh(template, scan, config=painted)
+    grey = np.full((len(scan.vertices), 3), 128, np.uint8)
+    with pytest.raises(InputError, match=r"border colour #ffd200 not found"):
+        register_mesh(template, scan, colours=grey, config=painted)
+    with pytest.raises(InputError, match=r"expected the unit of template"):
+        register_mesh(template, scaled(scan, 1000), config=quick)
+    closed = Mesh(np.eye(4, 3, dtype=np.float32), np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], np.int32))
+    with pytest.raises(InputError, match="expected open borders"):
+        register_mesh(closed, scan, colours=np.tile(np.array([PAINT], np.uint8), (len(scan.vertices), 1)), config=painted)
+
+
+def test_units_are_guessed_from_size(garment) -> None:
+    assert [guess_units(scaled(garment.template, factor)) for factor in (1, 100, 1000)] == ["m", "cm", "mm"]
+
+
+def test_schedules_anneal_geometrically() -> None:
+    from registration.register import anneal
+
+    schedule = Schedule(3, (0.1, 0.001))
+    assert [anneal(schedule.gate, step, 3) for step in range(3)] == pytest.approx([0.1, 0.01, 0.001])
+    assert anneal((0.0, 4.0), 1, 3) == 2.0

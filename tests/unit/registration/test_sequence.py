@@ -1,0 +1,153 @@
+"""Predictions, segments, failures and resuming, on a tube around one bending bone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from capture4d.body import pose_frame, skin
+from capture4d.errors import InputError
+from capture4d.types import Body, Garment, Mesh, PoseSequence
+from registration.config import SequenceConfig
+from registration.sequence import Mover, register_run, segments
+from registration.template import analyse_template
+
+FRAMES = 6
+
+
+@pytest.fixture
+def body() -> Body:
+    mesh = Mesh(np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]], np.float32), np.array([[0, 1, 2]], np.int32))
+    return Body(
+        template=mesh,
+        shape_directions=np.zeros((1, 3, 3), np.float32),
+        joints=np.array([[0, 0, 0], [0, 0.25, 0]], np.float32),
+        joint_directions=np.zeros((1, 2, 3), np.float32),
+        joint_names=("root", "top"),
+        parents=np.array([-1, 0], np.int32),
+        skin_weights=np.tile(np.array([[1, 0]], np.float32), (3, 1)),
+    )
+
+
+@pytest.fixture
+def poses() -> PoseSequence:
+    rotations = np.tile(np.eye(3, dtype=np.float32), (FRAMES, 2, 1, 1))
+    rotations[:, 1] = Rotation.from_euler("z", np.linspace(0, 20, FRAMES)[:, None], degrees=True).as_matrix()
+    return PoseSequence(
+        rotations, np.zeros((FRAMES, 3), np.float32), np.zeros(1, np.float32), np.arange(FRAMES, dtype=np.int32) * 10,
+        60.0, ("root", "top"),
+    )  # fmt: skip
+
+
+@pytest.fixture
+def bound(garment: Garment) -> Garment:
+    return replace(garment, skin_weights=weights_at(garment.template.vertices))
+
+
+def weights_at(points: np.ndarray) -> np.ndarray:
+    top = np.clip((points[:, 1] - 0.15) / 0.2, 0, 1)
+    return np.column_stack([1 - top, top]).astype(np.float32)
+
+
+@pytest.fixture
+def load(scan_of, body, poses):
+    """Scans of a tube that moves with the bone exactly."""
+
+    def read(frame_id: int):
+        def warp(points: np.ndarray) -> np.ndarray:
+            shaped = Mover.create(analysis, body, poses).shaped
+            return skin(points, weights_at(points), pose_frame(shaped, poses, frame_id // 10).transforms)
+
+        return replace(scan_of(warp), frame_id=frame_id)
+
+    analysis = None
+
+    def set_up(found):
+        nonlocal analysis
+        analysis = found
+        return read
+
+    return set_up
+
+
+def go(analysis, mover, load, config, done=lambda frame_id: None):
+    frame_ids = tuple(range(0, 10 * FRAMES, 10))
+    return list(register_run(analysis, mover, range(FRAMES), frame_ids, load=load, done=done, config=config))
+
+
+def test_carrying_within_one_pose_changes_nothing(bound, body, poses, config) -> None:
+    mover = Mover.create(analyse_template(bound, config), body, poses)
+    skinned = mover.skinned(3)
+    moved = (skinned + 0.01 * np.random.default_rng(0).standard_normal(skinned.shape)).astype(np.float32)
+    np.testing.assert_allclose(mover.carried(moved, 3, 3, 1.0), moved, atol=1e-6)
+    np.testing.assert_allclose(mover.carried(moved, 3, 5, 0.0), mover.skinned(5), atol=1e-6)
+
+
+def test_joints_must_agree(bound, body, poses, config) -> None:
+    with pytest.raises(InputError, match="expected the body's 2 joints"):
+        Mover.create(analyse_template(bound, config), body, replace(poses, joint_names=("root", "other")))
+
+
+def test_without_poses_there_is_one_segment(bound, body, poses, config) -> None:
+    assert segments(None, 500, SequenceConfig(segment=10)) == [range(500)]
+    mover = Mover.create(analyse_template(bound, config), body, poses)
+    assert segments(mover, FRAMES, SequenceConfig(segment=100)) == [range(FRAMES)]
+
+
+def test_segments_start_near_the_rest_pose(bound, body, poses, config) -> None:
+    there_and_back = [*range(FRAMES), *reversed(range(FRAMES))] * 2
+    long = replace(
+        poses, rotations=poses.rotations[there_and_back], translations=np.zeros((4 * FRAMES, 3), np.float32),
+        frame_ids=np.arange(4 * FRAMES, dtype=np.int32),
+    )  # fmt: skip
+    mover = Mover.create(analyse_template(bound, config), body, long)
+    cut = segments(mover, 4 * FRAMES, SequenceConfig(segment=8, keyframe_bend_deg=1.0))
+    assert [part.start for part in cut] == [0, 2 * FRAMES - 1]
+    assert cut[-1].stop == 4 * FRAMES
+
+
+def test_frames_follow_the_scan_and_start_from_the_best(bound, body, poses, config, load) -> None:
+    analysis = analyse_template(bound, config)
+    mover = Mover.create(analysis, body, poses)
+    results = go(analysis, mover, load(analysis), config)
+    assert [result.quality.verdict for result in results] == ["good"] * FRAMES
+    assert results[0].started_from == "skinned, cold"
+    assert all(result.started_from.endswith("warm") for result in results[1:])
+    for index, result in enumerate(results):
+        assert np.linalg.norm(result.vertices - mover.skinned(index), axis=1).mean() < 0.003
+
+
+def test_a_failing_frame_is_flagged_and_the_take_goes_on(bound, body, poses, config, load) -> None:
+    analysis = analyse_template(bound, config)
+    read = load(analysis)
+
+    def broken(frame_id: int):
+        if frame_id == 20:
+            raise InputError("scans/000020.ply: cut off")
+        return read(frame_id)
+
+    results = go(analysis, Mover.create(analysis, body, poses), broken, config)
+    assert [result.quality.verdict for result in results] == ["good", "good", "failed", "good", "good", "good"]
+    assert results[2].quality.reasons == ("scans/000020.ply: cut off",)
+    assert np.isnan(results[2].quality.residual_m).all()
+    assert np.isfinite(results[2].vertices).all()
+
+
+def test_resuming_gives_the_same_bits(bound, body, poses, config, load) -> None:
+    analysis = analyse_template(bound, config)
+    mover, read = Mover.create(analysis, body, poses), load(analysis)
+    whole = go(analysis, mover, read, config)
+    earlier = {result.frame_id: (result.vertices, True) for result in whole[:3]}
+    rest = go(analysis, mover, read, config, done=earlier.get)
+    assert [result.frame_id for result in rest] == [30, 40, 50]
+    for first, second in zip(whole[3:], rest, strict=True):
+        np.testing.assert_array_equal(first.vertices, second.vertices)
+
+
+def test_without_a_body_frames_follow_one_another(garment, body, poses, config, load, bound) -> None:
+    read = load(analyse_template(bound, config))
+    results = go(analyse_template(garment, config), None, read, config)
+    assert [result.quality.verdict for result in results] == ["good"] * FRAMES
+    assert results[0].started_from == "template, cold"
+    assert results[1].started_from.startswith("previous")
