@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from data_synth.scanner_config import RigConfig, ScannerConfig
+from data_synth.scanner_config import FusionConfig, RigConfig, ScannerConfig
 
 ClipName = Literal["range-of-motion", "twist", "reach", "side-bend", "sampled"]
 
@@ -155,9 +155,12 @@ PRESETS: dict[str, SynthConfig] = {
         frames=6,
         capture_every=4,
         template_vertices=1500,
-        simulation=SimulationConfig(vertices=1600, substeps=8, calm_frames=14, approach_frames=12, rest_frames=6),
+        simulation=SimulationConfig(vertices=1600, substeps=12, calm_frames=18, approach_frames=16, rest_frames=8),
         relaxation=RelaxationConfig(vertices=12_000, sweeps=40),
-        scanner=ScannerConfig(rig=RigConfig(cameras=20, image_size=320)),
+        scanner=ScannerConfig(
+            rig=RigConfig(cameras=24, image_size=320),
+            fusion=FusionConfig(garment_voxel_m=0.005, body_voxel_m=0.009, min_component_faces=120),
+        ),
     ),
     "tshirt-200k": _FULL,
     "tshirt-cotton-200k": replace(_FULL, name="tshirt-cotton-200k", fabric="shirt-cotton", seed=1),
