@@ -93,7 +93,7 @@ def gauss_newton_step(
     floor = max(float(diagonal[:, axis, axis].max(initial=0.0)) * 1e-12, 1e-300)
     extra = damping * diagonal[:, axis, axis] + floor
     diagonal[:, axis, axis] += extra
-    inverse = np.linalg.inv(diagonal)
+    inverse = invert_points(diagonal) if size == 3 else np.linalg.inv(diagonal)
 
     def product(direction: np.ndarray) -> np.ndarray:
         result = extra.reshape(direction.shape) * direction
@@ -176,32 +176,57 @@ def rows_transpose(offsets, columns, coefficients, metric, residual, result):
                 result[column, 2, b] += p2 * c
 
 
-@njit(cache=True)
 def rows_normal_product(offsets, columns, coefficients, metric, blocks, result):
-    """result += J^T M J X, one row after the other."""
-    rows, width = len(offsets) - 1, coefficients.shape[1]
-    for row in range(rows):
-        m = metric[row]
-        if m[0, 0] == 0.0 and m[1, 1] == 0.0 and m[2, 2] == 0.0:
+    """result += J^T M J X, one row after the other: where the time goes, so each width has its own loop."""
+    if coefficients.shape[1] == 1:
+        normal_product_points(offsets, columns, coefficients[:, 0], metric, blocks[:, :, 0], result[:, :, 0])
+    else:
+        normal_product_affine(offsets, columns, coefficients, metric, blocks, result)
+
+
+@njit(cache=True)
+def normal_product_points(offsets, columns, coefficients, metric, points, result):
+    """`rows_normal_product` of blocks that are points."""
+    for row in range(len(offsets) - 1):
+        r0, r1, r2 = 0.0, 0.0, 0.0
+        for entry in range(offsets[row], offsets[row + 1]):
+            column, c = columns[entry], coefficients[entry]
+            r0 += points[column, 0] * c
+            r1 += points[column, 1] * c
+            r2 += points[column, 2] * c
+        p0 = metric[row, 0, 0] * r0 + metric[row, 0, 1] * r1 + metric[row, 0, 2] * r2
+        p1 = metric[row, 1, 0] * r0 + metric[row, 1, 1] * r1 + metric[row, 1, 2] * r2
+        p2 = metric[row, 2, 0] * r0 + metric[row, 2, 1] * r1 + metric[row, 2, 2] * r2
+        for entry in range(offsets[row], offsets[row + 1]):
+            column, c = columns[entry], coefficients[entry]
+            result[column, 0] += p0 * c
+            result[column, 1] += p1 * c
+            result[column, 2] += p2 * c
+
+
+@njit(cache=True)
+def normal_product_affine(offsets, columns, coefficients, metric, nodes, result):
+    """`rows_normal_product` of blocks that are affine maps."""
+    for row in range(len(offsets) - 1):
+        if metric[row, 0, 0] == 0.0 and metric[row, 1, 1] == 0.0 and metric[row, 2, 2] == 0.0:
             continue
         r0, r1, r2 = 0.0, 0.0, 0.0
         for entry in range(offsets[row], offsets[row + 1]):
-            column = columns[entry]
-            for b in range(width):
-                c = coefficients[entry, b]
-                r0 += blocks[column, 0, b] * c
-                r1 += blocks[column, 1, b] * c
-                r2 += blocks[column, 2, b] * c
-        p0 = m[0, 0] * r0 + m[0, 1] * r1 + m[0, 2] * r2
-        p1 = m[1, 0] * r0 + m[1, 1] * r1 + m[1, 2] * r2
-        p2 = m[2, 0] * r0 + m[2, 1] * r1 + m[2, 2] * r2
+            n = columns[entry]
+            a, b, c, d = coefficients[entry, 0], coefficients[entry, 1], coefficients[entry, 2], coefficients[entry, 3]
+            r0 += nodes[n, 0, 0] * a + nodes[n, 0, 1] * b + nodes[n, 0, 2] * c + nodes[n, 0, 3] * d
+            r1 += nodes[n, 1, 0] * a + nodes[n, 1, 1] * b + nodes[n, 1, 2] * c + nodes[n, 1, 3] * d
+            r2 += nodes[n, 2, 0] * a + nodes[n, 2, 1] * b + nodes[n, 2, 2] * c + nodes[n, 2, 3] * d
+        p0 = metric[row, 0, 0] * r0 + metric[row, 0, 1] * r1 + metric[row, 0, 2] * r2
+        p1 = metric[row, 1, 0] * r0 + metric[row, 1, 1] * r1 + metric[row, 1, 2] * r2
+        p2 = metric[row, 2, 0] * r0 + metric[row, 2, 1] * r1 + metric[row, 2, 2] * r2
         for entry in range(offsets[row], offsets[row + 1]):
-            column = columns[entry]
-            for b in range(width):
-                c = coefficients[entry, b]
-                result[column, 0, b] += p0 * c
-                result[column, 1, b] += p1 * c
-                result[column, 2, b] += p2 * c
+            n = columns[entry]
+            for k in range(4):
+                c = coefficients[entry, k]
+                result[n, 0, k] += p0 * c
+                result[n, 1, k] += p1 * c
+                result[n, 2, k] += p2 * c
 
 
 @njit(cache=True)
@@ -220,6 +245,24 @@ def add_block_diagonal(offsets, columns, coefficients, metric, diagonal):
                     for i in range(3):
                         for j in range(3):
                             block[i * width + b, j * width + d] += weight * m[i, j]
+
+
+@njit(cache=True)
+def invert_points(matrices):
+    """Inverses of symmetric positive 3x3 matrices, by their adjugates."""
+    result = np.empty_like(matrices)
+    for n in range(len(matrices)):
+        a, b, c = matrices[n, 0, 0], matrices[n, 0, 1], matrices[n, 0, 2]
+        d, e, f = matrices[n, 1, 1], matrices[n, 1, 2], matrices[n, 2, 2]
+        aa, bb, cc = d * f - e * e, c * e - b * f, b * e - c * d
+        scale = 1.0 / (a * aa + b * bb + c * cc)
+        result[n, 0, 0] = aa * scale
+        result[n, 0, 1] = result[n, 1, 0] = bb * scale
+        result[n, 0, 2] = result[n, 2, 0] = cc * scale
+        result[n, 1, 1] = (a * f - c * c) * scale
+        result[n, 1, 2] = result[n, 2, 1] = (b * c - a * e) * scale
+        result[n, 2, 2] = (a * d - b * b) * scale
+    return result
 
 
 @njit(cache=True)

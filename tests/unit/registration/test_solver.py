@@ -9,6 +9,7 @@ from registration.solver import (
     RowTerm,
     add_block_diagonal,
     gauss_newton_step,
+    invert_points,
     rows_normal_product,
     rows_transpose,
 )
@@ -109,3 +110,9 @@ def test_a_block_without_residuals_stays() -> None:
     step, _ = gauss_newton_step([term], None, 2, damping=1e-9, tolerance=1e-10, max_iterations=10)
     np.testing.assert_allclose(step[0, :, 0], [-1, -2, -3], rtol=1e-6)
     np.testing.assert_array_equal(step[1], 0)
+
+
+def test_point_inverses() -> None:
+    root = np.random.default_rng(4).standard_normal((20, 3, 3))
+    matrices = root @ root.transpose(0, 2, 1) + 0.1 * np.eye(3)
+    np.testing.assert_allclose(invert_points(matrices), np.linalg.inv(matrices), rtol=1e-8, atol=1e-10)
