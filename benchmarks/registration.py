@@ -25,7 +25,7 @@ from typing import Literal
 
 import numpy as np
 from rich.console import Console
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from benchmarks.metric import Metric
 from benchmarks.peers import PEERS, run_peer
@@ -80,7 +80,7 @@ class Case:
     true_borders: Mapping[str, np.ndarray]
 
     def covered(self) -> np.ndarray:
-        return cKDTree(self.scan.mesh.vertices).query(self.places)[0] < COVERED_M
+        return KDTree(self.scan.mesh.vertices).query(self.places)[0] < COVERED_M
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,18 +251,18 @@ def _comparison(garment: Garment, cases: Sequence[Case], warm_cpu_s: float) -> l
 
 def _comparison_metrics(scores: Mapping[str, Scores], warm_cpu_s: float) -> list[Metric]:
     metrics = [Metric("cold_cpu_s", scores["default"].cpu_s, "s")]
-    for name, score in scores.items():
-        for key in Scores.__dataclass_fields__:
-            metrics.append(Metric(f"{name}_{key}", getattr(score, key), "s" if key == "cpu_s" else "mm"))
+    metrics += [
+        Metric(f"{name}_{key}", getattr(score, key), "s" if key == "cpu_s" else "mm")
+        for name, score in scores.items()
+        for key in Scores.__dataclass_fields__
+    ]
     best = {
         key: min(getattr(scores[name], key) for name in PEERS)
         for key in ("truth_distance_mean_mm", "truth_distance_p95_mm", "missed_mean_mm", "correspondence_mean_mm")
     }
     for key, value in best.items():
         metrics.append(Metric(f"{key.removesuffix('_mm')}_ratio_to_best_peer", getattr(scores["default"], key) / value))
-    metrics.append(
-        Metric("cpu_ratio_to_nricp_amberg", scores["nricp_amberg"].cpu_s / warm_cpu_s, "", "higher")
-    )
+    metrics.append(Metric("cpu_ratio_to_nricp_amberg", scores["nricp_amberg"].cpu_s / warm_cpu_s, "", "higher"))
     return metrics
 
 
@@ -271,15 +271,20 @@ def _score(garment: Garment, case: Case, vertices: np.ndarray, cpu_s: float) -> 
     there, back = truth_distances(registered, case.truth, covered=case.covered())
     borders = border_errors({name: vertices[loop] for name, loop in garment.loops.items()}, case.true_borders)
     matched = correspondence_errors(vertices, case.places)
-    values = [
-        there.mean(), np.percentile(there, 95), back.mean(), borders.mean(), np.percentile(borders, 95),
-        matched.mean(), np.percentile(matched, 95),
-    ]  # fmt: skip
-    return Scores(*(float(1e3 * value) for value in values), cpu_s)
+    return Scores(
+        truth_distance_mean_mm=float(1e3 * there.mean()),
+        truth_distance_p95_mm=float(1e3 * np.percentile(there, 95)),
+        missed_mean_mm=float(1e3 * back.mean()),
+        border_mean_mm=float(1e3 * borders.mean()),
+        border_p95_mm=float(1e3 * np.percentile(borders, 95)),
+        correspondence_mean_mm=float(1e3 * matched.mean()),
+        correspondence_p95_mm=float(1e3 * np.percentile(matched, 95)),
+        cpu_s=cpu_s,
+    )
 
 
 def _mean(scores: Sequence[Scores]) -> Scores:
-    return Scores(*(float(np.mean([getattr(s, key) for s in scores])) for key in Scores.__dataclass_fields__))
+    return Scores(**{key: float(np.mean([getattr(s, key) for s in scores])) for key in Scores.__dataclass_fields__})
 
 
 def _median(values: Sequence[float]) -> float:

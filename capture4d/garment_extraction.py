@@ -4,9 +4,10 @@ Paints are told apart by chroma: the direction of linear RGB, which shading hard
 around the paint's own. Vertices of mixed colour between two paints go with the majority of their neighbours; only parts
 that contain garment colour survive, so that a hand of the border's colour does not.
 
-A border point is a vertex on an open edge of what was cut out (whether the scan ends there or the next colour begins)
-that lies on paint and on the paint's far side, seen from the garment: along the surface it is almost a band's width away
-from garment colour. Rims of occlusion holes are nearer, or not on paint, and drop out.
+A border point comes from a vertex on an open edge of what was cut out, whether the scan ends there or the next colour
+begins, that lies on the far side of the paint: along the surface it is almost a band's width away from garment colour.
+Rims of occlusion holes are nearer, or not on paint, and drop out. A scan stops short of its borders; the points are
+moved outwards by what is missing.
 """
 
 from __future__ import annotations
@@ -62,9 +63,9 @@ def extract_garment(
     Raises:
         ColourNotFoundError: the garment's or a border's colour is not in the scan.
     """
-    paints = tuple(dict.fromkeys(tuple(colour) for colour in boundary_colours.values()))
-    labels = classify_colours(scan.colours, tuple(garment_colour), paints)
-    _require_colours(labels, tuple(garment_colour), paints, source)
+    paints = tuple(dict.fromkeys(boundary_colours.values()))
+    labels = classify_colours(scan.colours, garment_colour, paints)
+    _require_colours(labels, garment_colour, paints, source)
     faces = scan.mesh.faces
     labels = settle_labels(faces, labels)
     mask = _garment_faces(faces, labels)
@@ -101,8 +102,8 @@ def painted_border(
     painted = label[(quantised[:, 0] << 12) | (quantised[:, 1] << 6) | quantised[:, 2]] == GARMENT
     if painted.mean() < MIN_SHARE:
         raise ColourNotFoundError(
-            f"{source}: border colour {_hex(paint)} not found: expected at least {100 * MIN_SHARE:g} % of the vertices, "
-            f"found {100 * painted.mean():.2g} %"
+            f"{source}: border colour {_hex(paint)} not found: expected at least {100 * MIN_SHARE:g} % of the "
+            f"vertices, found {100 * painted.mean():.2g} %"
         )
     labels = settle_labels(mesh.faces, np.where(painted, FIRST_PAINT, GARMENT).astype(np.uint8))
     return _border_points(mesh, labels, 1)[0]
@@ -228,7 +229,7 @@ def _across_the_paint(mesh: Mesh, labels: np.ndarray) -> tuple[np.ndarray, np.nd
 
 def _loops_of_paints(boundary_colours: Mapping[str, Colour], paints: tuple[Colour, ...]) -> np.ndarray:
     """The loop each paint stands for, or -1 where several loops wear it."""
-    colours = [tuple(colour) for colour in boundary_colours.values()]
+    colours = list(boundary_colours.values())
     return np.array([colours.index(paint) if colours.count(paint) == 1 else -1 for paint in paints], np.int32)
 
 

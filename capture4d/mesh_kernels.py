@@ -86,7 +86,7 @@ def vertex_normals_kernel(positions, faces):
 
 @njit(cache=True)
 def face_components(faces, count, active):
-    """Smallest vertex of the part that each face belongs to, parts being joined through active faces; -1 if inactive."""
+    """The part each face belongs to, named by its smallest vertex; parts are joined by active faces, others get -1."""
     parent = np.arange(count)
     for f in range(len(faces)):
         if active[f]:

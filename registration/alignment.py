@@ -13,7 +13,7 @@ from itertools import permutations, product
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 __all__ = ["Similarity", "align", "fit_similarity"]
 
@@ -59,7 +59,7 @@ def align(
     rng = np.random.default_rng(0)
     source = template[np.sort(rng.permutation(len(template))[:SAMPLES])]
     target = scan[np.sort(rng.permutation(len(scan))[: 4 * SAMPLES])]
-    tree = cKDTree(target)
+    tree = KDTree(target)
     guesses = [Similarity(np.eye(3), np.zeros(3)), *_axis_guesses(source, target, with_scale)]
     tried = [_icp(guess, source, target, tree, with_scale, steps=8) for guess in guesses]
     best = sorted(tried, key=lambda pair: pair[0])[:3]
@@ -82,7 +82,7 @@ def _axis_guesses(source: np.ndarray, target: np.ndarray, with_scale: bool) -> l
 
 
 def _icp(
-    guess: Similarity, source: np.ndarray, target: np.ndarray, tree: cKDTree, with_scale: bool, *, steps: int
+    guess: Similarity, source: np.ndarray, target: np.ndarray, tree: KDTree, with_scale: bool, *, steps: int
 ) -> tuple[float, Similarity]:
     """Trimmed ICP; the symmetric trimmed distance that is left, and the result."""
     current = guess
@@ -98,5 +98,5 @@ def _icp(
             break
     moved = current.apply(source)
     there = np.sort(tree.query(moved)[0])[:kept]
-    back = np.sort(cKDTree(moved).query(target[::4])[0])
+    back = np.sort(np.asarray(KDTree(moved).query(target[::4])[0]))
     return float(there.mean() + back[: max(1, int(TRIM * len(back)))].mean()), current

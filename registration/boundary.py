@@ -1,8 +1,8 @@
 """Where each border vertex of the template should go: DeepWrinkles (ECCV 2018) Eq. 2 and three variants.
 
 Every painted scan point votes for its nearest template border vertex; C(t) are the voters of border vertex t. The
-paper prints s_t = max over C(t) of |t - s|, where a point is needed: the argmax. C(t) may be empty, then t has no target
-and no term. C changes as the template moves, so targets are asked for anew before every Gauss-Newton step.
+paper prints s_t = max over C(t) of |t - s|, where a point is needed: the argmax. C(t) may be empty, then t has no
+target and no term. C changes as the template moves, so targets are asked for anew before every Gauss-Newton step.
 
     argmax   the farthest voter: reaches into folds that the nearest point ignores, but slides vertices along the
              curve, because the farthest point of a cell is on average off its centre
@@ -20,7 +20,7 @@ from typing import Literal, assert_never
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int32
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 __all__ = ["BorderTargets", "border_targets", "tangent_free_metric"]
 
@@ -81,12 +81,12 @@ def _one_group(
     border: np.ndarray, scan_points: np.ndarray, rule: Literal["argmax", "nearest", "mean"], gate: float
 ) -> tuple[np.ndarray, np.ndarray]:
     if rule == "nearest":
-        distance, index = cKDTree(scan_points).query(border, distance_upper_bound=gate)
+        distance, index = KDTree(scan_points).query(border, distance_upper_bound=gate)
         found = np.isfinite(distance)
         return scan_points[np.where(found, index, 0)], found
-    distance, voted = cKDTree(border).query(scan_points, distance_upper_bound=gate)
-    voter = np.flatnonzero(np.isfinite(distance))
-    voted, distance = voted[voter], distance[voter]
+    all_distances, nearest = map(np.asarray, KDTree(border).query(scan_points, distance_upper_bound=gate))
+    voter = np.flatnonzero(np.isfinite(all_distances))
+    voted, distance = nearest[voter], all_distances[voter]
     targets, found = border.copy(), np.zeros(len(border), bool)
     found[voted] = True
     if rule == "argmax":

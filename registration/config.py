@@ -134,7 +134,7 @@ class DenseConfig:
     warm: Schedule = Schedule(3, (0.02, 0.012), smooth=(0.03, 0.02), stretch=(10.0, 0.05), boundary=(0.2, 0.1))
     """After a warm coarse stage."""
     plasticity: float = 0.5
-    """Share of the bending that is forgiven between steps: 0 keeps the shape of the coarse stage, 1 only damps change."""
+    """Share of the bending that is forgiven between steps: 0 keeps the coarse stage's shape, 1 only damps change."""
     compression: float = 0.5
     """Share of the stretch weight that resists shortening: folds finer than the template's edges shorten them."""
 

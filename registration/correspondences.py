@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int, Integer
 from scipy import sparse
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from capture4d.mesh_kernels import laplacian_pass, open_vertices, vertex_normals_kernel
 
@@ -33,7 +33,7 @@ class ScanSurface:
     """Unit normals."""
     rim: Bool[np.ndarray, " points"]
     """True on open edges: borders and the rims of holes."""
-    tree: cKDTree
+    tree: KDTree
     spacing: float
     """Mean edge length, metres: what the scan resolves."""
 
@@ -70,7 +70,7 @@ def prepare_scan(
     spacing = float(np.sqrt((edge * edge).sum(axis=1)).mean())
     if not used.all():
         positions, normals, rim = positions[used], normals[used], rim[used]
-    tree = cKDTree(positions, balanced_tree=False, compact_nodes=False)
+    tree = KDTree(positions, balanced_tree=False, compact_nodes=False)
     return ScanSurface(positions, normals, rim, tree, spacing)
 
 
@@ -135,7 +135,7 @@ def match_both_ways(
     max_points: int,
     normal_length: float,
 ) -> Matches:
-    """Soft matches that the scan has a say in: each point's nearest scan points and the points nearest to each scan point.
+    """Soft matches in which the scan has a say: nearest scan points of each point, nearest points of each scan point.
 
     Both lists of nearest neighbours, in position and normal, are weighed by inverse squared distance, made to sum to
     one per voter, and added; the matched plane is their weighted mean. Scan that sticks out beyond the template's edge
@@ -151,8 +151,8 @@ def match_both_ways(
     voters = np.arange(0, len(surface.points), stride)
     scan_features = np.concatenate([surface.points[voters], normal_length * surface.normals[voters]], axis=1)
     features = np.concatenate([points, normal_length * normals], axis=1)
-    pull_distance, pull = cKDTree(scan_features, balanced_tree=False).query(features, k=neighbours)
-    push_distance, push = cKDTree(features, balanced_tree=False).query(scan_features, k=neighbours)
+    pull_distance, pull = KDTree(scan_features, balanced_tree=False).query(features, k=neighbours)
+    push_distance, push = KDTree(features, balanced_tree=False).query(scan_features, k=neighbours)
     rows = np.concatenate([np.repeat(np.arange(len(points)), neighbours), push.reshape(-1)])
     columns = np.concatenate([pull.reshape(-1), np.repeat(np.arange(len(voters)), neighbours)])
     affinity = np.concatenate([_affinity(pull_distance).reshape(-1), _affinity(push_distance).reshape(-1)])
@@ -164,7 +164,7 @@ def match_both_ways(
     away = np.linalg.norm(points - target, axis=1)
     weights = 1.0 / (1.0 + (away / (robust_scale * gate)) ** 2) ** 2
     weights[(away > gate) | (np.einsum("va,va->v", normals, normal) < min_normal_cosine)] = 0.0
-    return Matches(target, normal, weights, away, voters[pull[:, 0]])
+    return Matches(target, normal, weights, away, voters[np.asarray(pull)[:, 0]])
 
 
 def _affinity(distance: np.ndarray) -> np.ndarray:

@@ -1,10 +1,10 @@
 """How good a registered frame is, from the scan alone: numbers, and a verdict with its reasons.
 
-    fit          template vertex to the scan's surface, over vertices with scan data; and scan point to template
-    border       template border to painted points, and painted points to the template's border curve
-    stretch      edge lengths over the template's
-    flips        faces that look the other way than the scan they lie on
-    intersections  faces that cut another face of the template
+fit          template vertex to the scan's surface, over vertices with scan data; and scan point to template
+border       template border to painted points, and painted points to the template's border curve
+stretch      edge lengths over the template's
+flips        faces that look the other way than the scan they lie on
+intersections  faces that cut another face of the template
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float64
 from numba import njit
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from registration.config import QualityConfig
 from registration.correspondences import mesh_normals
@@ -94,16 +94,16 @@ def border_distances(
         start, end = vertices[border.vertices[own]], vertices[border.after[own]]
         if not len(start) or not len(painted):
             continue
-        found.append(cKDTree(painted).query(start)[0])
+        found.append(KDTree(painted).query(start)[0])
         steps = np.linspace(0.0, 1.0, 8, endpoint=False)[:, None, None]
-        found.append(cKDTree(((1.0 - steps) * start + steps * end).reshape(-1, 3)).query(painted)[0])
+        found.append(KDTree(((1.0 - steps) * start + steps * end).reshape(-1, 3)).query(painted)[0])
     return np.concatenate(found) if found else np.zeros(0)
 
 
 def _points_to_template(points: np.ndarray, vertices: np.ndarray, analysis: TemplateAnalysis) -> np.ndarray:
     """Distance to the faces around each point's nearest template vertex, metres."""
     used = np.unique(analysis.faces)
-    nearest = used[cKDTree(vertices[used]).query(points)[1]]
+    nearest = used[KDTree(vertices[used]).query(points)[1]]
     return fan_distances(points, nearest, vertices, analysis.faces, analysis.fan_offsets, analysis.fan_faces)
 
 
@@ -113,28 +113,30 @@ def count_intersecting_faces(vertices: Float64[np.ndarray, "verts 3"], faces: np
     centre = corners.mean(axis=1)
     reach = np.sqrt(((corners - centre[:, None]) ** 2).sum(axis=2).max(axis=1))
     radius = 2.0 * float(np.percentile(reach, 99))
-    pairs = cKDTree(centre, balanced_tree=False).query_pairs(radius, output_type="ndarray")
+    pairs = KDTree(centre, balanced_tree=False).query_pairs(radius, output_type="ndarray")
     return int(intersecting_faces(vertices, faces, pairs).sum())
 
 
 def _judge(numbers: Mapping[str, float], faces: int, config: QualityConfig) -> tuple[Verdict, tuple[str, ...]]:
     share = 100.0 / max(faces, 1)
-    limits = [
-        ("fit_mean_mm", numbers["fit_mean_mm"], config.fit_check_mm, config.fit_fail_mm, "mm"),
-        ("boundary_mean_mm", numbers["boundary_mean_mm"], config.boundary_check_mm, config.boundary_fail_mm, "mm"),
+    flipped, cut = numbers["flipped_faces"] * share, numbers["self_intersections"] * share
+    covered = numbers["covered_percent"]
+    check, failed = [], []
+    for name, value, doubtful, wrong, unit in (
+        ("fit_mean_mm", numbers["fit_mean_mm"], config.fit_check_mm, config.fit_fail_mm, " mm"),
+        ("boundary_mean_mm", numbers["boundary_mean_mm"], config.boundary_check_mm, config.boundary_fail_mm, " mm"),
         ("stretch_p99", numbers["stretch_p99"], config.stretch_check, config.stretch_fail, ""),
-        ("flipped faces", numbers["flipped_faces"] * share, config.flipped_check_percent, np.inf, "%"),
-        (
-            "self-intersecting faces", numbers["self_intersections"] * share,
-            config.intersections_check_percent, np.inf, "%",
-        ),
-    ]  # fmt: skip
-    failed = [f"{name} {value:.2f} > {fail:g} {unit}".rstrip() for name, value, _, fail, unit in limits if value > fail]
-    if numbers["covered_percent"] < config.min_covered_percent:
-        failed.append(f"scan data for {numbers['covered_percent']:.0f} % < {config.min_covered_percent:g} % of vertices")
+        ("flipped faces", flipped, config.flipped_check_percent, np.inf, " %"),
+        ("self-intersecting faces", cut, config.intersections_check_percent, np.inf, " %"),
+    ):
+        if value > wrong:
+            failed.append(f"{name} {value:.2f} > {wrong:g}{unit}")
+        elif value > doubtful:
+            check.append(f"{name} {value:.2f} > {doubtful:g}{unit}")
+    if covered < config.min_covered_percent:
+        failed.append(f"scan data for {covered:.0f} % < {config.min_covered_percent:g} % of vertices")
     if failed:
         return "failed", tuple(failed)
-    check = [f"{name} {value:.2f} > {limit:g} {unit}".rstrip() for name, value, limit, _, unit in limits if value > limit]
     return ("check", tuple(check)) if check else ("good", ())
 
 

@@ -181,9 +181,7 @@ def _dense_stage(
         )  # fmt: skip
         terms.append(RowTerm(analysis.edge_rows, stretch, excess))
         bending = analysis.laplacian_rows.apply(vertices[:, :, None]) - reference
-        smooth = np.ascontiguousarray(
-            np.broadcast_to(anneal(schedule.smooth, *at) / count * np.eye(3), (count, 3, 3))
-        )
+        smooth = np.ascontiguousarray(np.broadcast_to(anneal(schedule.smooth, *at) / count * np.eye(3), (count, 3, 3)))
         terms.append(RowTerm(analysis.laplacian_rows, smooth, (1.0 - config.dense.plasticity) * bending))
         anchor = anneal(schedule.anchor, *at)
         if anchor > 0.0:

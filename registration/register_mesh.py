@@ -152,7 +152,8 @@ def _require_one_unit(template: float, scan: float, template_name: str, scan_nam
         raise InputError(f"{name}: expected a mesh with an extent, found all vertices in one place")
     if not 0.05 < scan / template < 20.0:
         raise InputError(
-            f"{scan_name}: expected the unit of {template_name}, which is {template:.4g} across; found {scan:.4g} across"
+            f"{scan_name}: expected the unit of {template_name}, which is {template:.4g} across; "
+            f"found {scan:.4g} across"
         )
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float64, Int32
 from numba import njit
 
-__all__ = ["BlockTerm", "Rows", "RowTerm", "add_block_diagonal", "gauss_newton_step", "rows_product", "rows_transpose"]
+__all__ = ["BlockTerm", "RowTerm", "Rows", "add_block_diagonal", "gauss_newton_step", "rows_product", "rows_transpose"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,7 +68,7 @@ def gauss_newton_step(
     tolerance: float,
     max_iterations: int,
 ) -> tuple[Float64[np.ndarray, "blocks 3 width"], int]:
-    """Solve (sum J^T M J + H + damping D) X = -(sum J^T M r + g), D the diagonal, by preconditioned conjugate gradients.
+    """Solve (sum J^T M J + H + damping D) X = -(sum J^T M r + g), D the diagonal, by block-Jacobi conjugate gradients.
 
     Args:
         damping: relative to the diagonal; keeps blocks that no residual touches in place.

@@ -1,11 +1,11 @@
 """The registration stage: CAPTURE and WORK/garment in, WORK/registration out.
 
-    stage.json                what was run
-    garment.npz               the template
-    frames/000123.npz         vertices (V, 3) and residual_m (V,) float32, verdict (0 good, 1 check, 2 failed)
-    metrics/000123.json       the frame's numbers, reasons and CPU time
-    vertices.npy              (T, V, 3) float32, all frames
-    metrics.jsonl             the frames' metrics, one per line
+stage.json                what was run
+garment.npz               the template
+frames/000123.npz         vertices (V, 3) and residual_m (V,) float32, verdict (0 good, 1 check, 2 failed)
+metrics/000123.json       the frame's numbers, reasons and CPU time
+vertices.npy              (T, V, 3) float32, all frames
+metrics.jsonl             the frames' metrics, one per line
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def run(
     )
     garment = read_template(description)
     if description.boundary_colours and not garment.loops:
-        raise InputError(f"{capture}: expected a template with open borders, for the scans have painted ones; found none")
+        raise InputError(f"{capture}: expected a template with open borders, as its scans have; found none")
     if not (output / "garment.npz").is_file():
         save_garment(output / "garment.npz", garment)
     mover = Mover.create(_analysis(capture, config), read_body(description), read_poses(description))

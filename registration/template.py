@@ -73,12 +73,11 @@ def analyse_template(garment: Garment, config: RegistrationConfig) -> TemplateAn
     if not len(faces):
         raise InputError("template: expected at least one face, found none")
     rest = garment.template.vertices.astype(np.float64)
-    graph = build_graph(
-        rest, faces, nodes=config.graph.nodes, nodes_per_vertex=config.graph.nodes_per_vertex
-    )
+    graph = build_graph(rest, faces, nodes=config.graph.nodes, nodes_per_vertex=config.graph.nodes_per_vertex)
     border = _border(garment)
     edges = unique_edges(faces)
     lengths = rest_lengths(garment.template, edges)
+    corners_per_vertex = np.bincount(faces.reshape(-1), minlength=len(rest))
     return TemplateAnalysis(
         garment=garment,
         faces=faces,
@@ -90,7 +89,7 @@ def analyse_template(garment: Garment, config: RegistrationConfig) -> TemplateAn
         border=border,
         vertex_rows=_rows([np.arange(len(rest))], [1.0]),
         edge_rows=_rows([edges[:, 0], edges[:, 1]], [-1.0, 1.0]),
-        fan_offsets=np.concatenate([[0], np.cumsum(np.bincount(faces.reshape(-1), minlength=len(rest)))]).astype(np.int32),
+        fan_offsets=np.concatenate([[0], np.cumsum(corners_per_vertex)]).astype(np.int32),
         fan_faces=(np.argsort(faces.reshape(-1), kind="stable") // 3).astype(np.int32),
         laplacian_rows=_laplacian_rows(edges, faces, len(rest)),
     )
@@ -149,7 +148,7 @@ def _rows(columns: list[np.ndarray], signs: list[float]) -> Rows:
 def _laplacian_rows(edges: np.ndarray, faces: np.ndarray, count: int) -> Rows:
     corners = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     keys = np.sort(corners, axis=1).astype(np.int64) @ np.array([1 << 32, 1])
-    unique, uses = np.unique(keys, return_counts=True)
+    _, uses = np.unique(keys, return_counts=True)
     on_border = uses == 1
     border_vertex = np.zeros(count, bool)
     border_vertex[edges[on_border].reshape(-1)] = True

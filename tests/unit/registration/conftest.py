@@ -77,5 +77,7 @@ def exact() -> RegistrationConfig:
         solver=LinearSolverConfig(tolerance=1e-6, max_iterations=500),
         data=DataConfig(smoothing_passes=0),
         boundary=BoundaryConfig(coarse_rule="nearest", dense_rule="nearest"),
-        graph=GraphConfig(nodes=40, vertices=0), coarse=CoarseConfig(cold=steps), dense=DenseConfig(cold=dense)
+        graph=GraphConfig(nodes=40, vertices=0),
+        coarse=CoarseConfig(cold=steps),
+        dense=DenseConfig(cold=dense),
     )

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from capture4d.types import Mesh
@@ -40,7 +40,7 @@ def test_alignment_from_any_pose(tube: Callable[[int, int], Mesh], seed: int) ->
     scan = 1.3 * motion.apply(tapered(tube(90, 45))) + [3.0, -1.0, 0.5]
     found = align(tapered(tube(36, 18)), scan, with_scale=True)
     assert found.scale == pytest.approx(1.3, rel=0.02)
-    distance = cKDTree(scan).query(found.apply(tapered(tube(36, 18))))[0]
+    distance = KDTree(scan).query(found.apply(tapered(tube(36, 18))))[0]
     assert distance.mean() < 0.008
 
 

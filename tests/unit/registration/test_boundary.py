@@ -43,7 +43,7 @@ def test_loops_keep_to_themselves_where_the_paint_tells() -> None:
 
 @pytest.mark.parametrize("rule", ["argmax", "mean", "nearest"])
 def test_the_gate_holds(rule) -> None:
-    found = border_targets(TEMPLATE, ONE_LOOP, SCAN + [0, 50, 0], NO_LOOPS, rule=rule, gate=10.0)
+    found = border_targets(TEMPLATE, ONE_LOOP, SCAN + np.array([0, 50, 0]), NO_LOOPS, rule=rule, gate=10.0)
     assert not found.valid.any()
 
 

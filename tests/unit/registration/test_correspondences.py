@@ -81,10 +81,8 @@ def test_the_layer_that_looks_the_right_way_is_matched(tube: Callable[[int, int]
     outward = vertex_normals(mesh.vertices, mesh.faces)
     inner = mesh.vertices - 0.002 * outward
     count = len(mesh.vertices)
-    surface = prepare_scan(
-        np.concatenate([mesh.vertices, inner]), np.concatenate([mesh.faces, mesh.faces[:, ::-1] + count]).astype(np.int32),
-        smoothing_passes=0,
-    )  # fmt: skip
+    faces = np.concatenate([mesh.faces, mesh.faces[:, ::-1] + count]).astype(np.int32)
+    surface = prepare_scan(np.concatenate([mesh.vertices, inner]), faces, smoothing_passes=0)
     points = (mesh.vertices - 0.0015 * outward).astype(float)
     found = match(surface, points, outward.astype(float), gate=0.05, min_normal_cosine=0.4, robust_scale=1.0)
     assert (found.weights > 0).all()

@@ -59,7 +59,7 @@ def test_inside_out_is_noticed(garment, scan_of, config) -> None:
 
 def test_border_distances_go_both_ways(garment, scan_of, config) -> None:
     analysis = analyse_template(garment, config)
-    frame = prepare_frame(analysis, scan_of(lambda p: p + [0, 0.004, 0]), config)
+    frame = prepare_frame(analysis, scan_of(lambda p: p + np.array([0, 0.004, 0])), config)
     distances = border_distances(analysis, frame, analysis.rest)
     np.testing.assert_allclose(np.median(distances), 0.004, atol=5e-4)
     assert len(distances) > len(analysis.border.vertices)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from capture4d.errors import InputError
@@ -43,7 +43,7 @@ def test_a_rigid_motion_is_recovered(garment, exact) -> None:
     rotation = Rotation.from_euler("xyz", [4, 3, -3], degrees=True)
 
     def move(points: np.ndarray) -> np.ndarray:
-        return rotation.apply(points.astype(float)) + [0.01, -0.015, 0.008]
+        return rotation.apply(points.astype(float)) + np.array([0.01, -0.015, 0.008])
 
     fine = subdivide(subdivide(garment.template))
     loops = list(garment.loops.values())
@@ -74,7 +74,7 @@ def test_equivariance_under_rigid_motions(garment, scan_of, config) -> None:
     garment = Garment(garment.template.with_vertices(start.astype(np.float32)), garment.loops)
 
     def moved(points: np.ndarray) -> np.ndarray:
-        return motion.apply(points) + [0.1, -0.2, 0.3]
+        return motion.apply(points) + np.array([0.1, -0.2, 0.3])
 
     config = replace(config, solver=LinearSolverConfig(tolerance=1e-8, max_iterations=2000))
     plain = fit(garment, scan_of(bend, noise=5e-4), start, config).vertices
@@ -95,7 +95,7 @@ def test_error_falls_with_the_resolution_of_the_scan(garment, scan_of, config) -
     errors = []
     for around in (40, 80, 160):
         result = fit(garment, scan_of(bend, around=around, along=around // 2), start, config)
-        errors.append(cKDTree(fine).query(result.vertices)[0].mean())
+        errors.append(KDTree(fine).query(result.vertices)[0].mean())
     assert errors[2] < errors[1] < errors[0]
 
 
@@ -115,7 +115,7 @@ def test_borders_are_found_only_when_asked_for(garment, scan_of, config) -> None
 
 
 def test_the_start_must_be_within_reach(garment, scan_of, config) -> None:
-    far = scan_of(lambda p: p + [5.0, 0, 0])
+    far = scan_of(lambda p: p + np.array([5.0, 0, 0]))
     with pytest.raises(InputError, match="frame 7: expected scan vertices within"):
         fit(garment, far, garment.template.vertices.astype(float), config)
 

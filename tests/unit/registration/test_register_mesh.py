@@ -92,8 +92,9 @@ def test_refusals(garment, scan_of, quick) -> None:
     with pytest.raises(InputError, match=r"expected the unit of template"):
         register_mesh(template, scaled(scan, 1000), config=quick)
     closed = Mesh(np.eye(4, 3, dtype=np.float32), np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], np.int32))
+    paint = np.tile(np.array([PAINT], np.uint8), (len(scan.vertices), 1))
     with pytest.raises(InputError, match="expected open borders"):
-        register_mesh(closed, scan, colours=np.tile(np.array([PAINT], np.uint8), (len(scan.vertices), 1)), config=painted)
+        register_mesh(closed, scan, colours=paint, config=painted)
 
 
 def test_units_are_guessed_from_size(garment) -> None:

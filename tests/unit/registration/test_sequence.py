@@ -59,7 +59,7 @@ def load(scan_of, body, poses):
             shaped = Mover.create(analysis, body, poses).shaped
             return skin(points, weights_at(points), pose_frame(shaped, poses, frame_id // 10).transforms)
 
-        return replace(scan_of(warp), frame_id=frame_id)
+        return replace(scan_of(warp, noise=3e-4), frame_id=frame_id)
 
     analysis = None
 
@@ -115,7 +115,7 @@ def test_frames_follow_the_scan_and_start_from_the_best(bound, body, poses, conf
     assert results[0].started_from == "skinned, cold"
     assert all(result.started_from.endswith("warm") for result in results[1:])
     for index, result in enumerate(results):
-        assert np.linalg.norm(result.vertices - mover.skinned(index), axis=1).mean() < 0.003
+        assert np.linalg.norm(result.vertices - mover.skinned(index), axis=1).mean() < 0.006
 
 
 def test_a_failing_frame_is_flagged_and_the_take_goes_on(bound, body, poses, config, load) -> None:
