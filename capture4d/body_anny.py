@@ -121,7 +121,7 @@ def _build(
     np.add.at(areas, faces.ravel(), np.repeat(face_areas(mean, faces) / 3, 3))
     root = np.sqrt(areas / areas.sum())[:, None]
     deviation = vertices - mean
-    left, spread, _ = np.linalg.svd((deviation * root).reshape(len(vertices), -1), full_matrices=False)
+    left, _, _ = np.linalg.svd((deviation * root).reshape(len(vertices), -1), full_matrices=False)
     scores = left[:, :SHAPE_COMPONENTS] * np.sqrt(len(vertices))
     directions = np.einsum("ns,nvc->svc", scores, deviation) / len(vertices)
     joint_directions = np.einsum("ns,njc->sjc", scores, joints - joint_mean) / len(vertices)

@@ -44,7 +44,7 @@ def _require_array(owner: str, name: str, value: Any, shape: tuple[int | None, .
 def _require_finite(owner: str, name: str, value: np.ndarray) -> None:
     if not np.isfinite(value).all():
         bad = int(np.count_nonzero(~np.isfinite(value).reshape(len(value), -1).all(axis=1)))
-        raise InputError(f"{owner}.{name}: expected finite numbers, found NaN or infinity in {bad} of {len(value)} rows")
+        raise InputError(f"{owner}.{name}: expected finite numbers, found NaN or inf in {bad} of {len(value)} rows")
 
 
 def _require_indices(owner: str, name: str, value: np.ndarray, count: int) -> None:
@@ -154,7 +154,7 @@ class Body:
     """Parent of each joint; -1 for the root, which is joint 0. Parents come before their children."""
     skin_weights: Float32[np.ndarray, "verts joints"]
     pose_directions: Float32[np.ndarray, "features verts 3"] | None = None
-    """SMPL-family pose correctives on the flattened (R - I) of all joints but the root; None where the body has none."""
+    """SMPL-family pose correctives on the flattened (R - I) of all joints but the root; None where there are none."""
     regions: UInt8[np.ndarray, " verts"] | None = None
     """0 body, 1 head, 2 hand, 3 foot: what a suit leaves bare."""
 
