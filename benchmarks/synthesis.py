@@ -66,7 +66,7 @@ def run(*, quick: bool = False, frames: int = 120, workers: int = 2) -> list[Met
             _Job(
                 replace(base, fabric=fabric, seed=seed),
                 scan_every=max(1, frames // 8),
-                converge_frames=50 if seed == 0 else 0,
+                converge_frames=40 if seed == 0 else 0,
                 late_start=frames // 3 if seed == 0 else None,
             )
             for fabric in ("jersey", "shirt-cotton")
