@@ -89,7 +89,7 @@ def _icp(
     kept = max(4, int(TRIM * len(source)))
     for _ in range(steps):
         moved = current.apply(source)
-        distance, nearest = tree.query(moved)
+        distance, nearest = map(np.asarray, tree.query(moved))
         close = np.argpartition(distance, kept - 1)[:kept]
         step = fit_similarity(source[close], target[nearest[close]], with_scale=with_scale)
         change = np.abs(step.rotation - current.rotation).max() + np.abs(step.translation - current.translation).max()
@@ -97,6 +97,6 @@ def _icp(
         if change < 1e-7:
             break
     moved = current.apply(source)
-    there = np.sort(tree.query(moved)[0])[:kept]
+    there = np.sort(np.asarray(tree.query(moved)[0]))[:kept]
     back = np.sort(np.asarray(KDTree(moved).query(target[::4])[0]))
     return float(there.mean() + back[: max(1, int(TRIM * len(back)))].mean()), current
