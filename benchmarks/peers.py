@@ -67,9 +67,7 @@ PEERS: Mapping[str, Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], n
 }
 
 
-def run_peer(
-    name: str, start: np.ndarray, faces: np.ndarray, scan: np.ndarray, scan_faces: np.ndarray
-) -> PeerResult:
+def run_peer(name: str, start: np.ndarray, faces: np.ndarray, scan: np.ndarray, scan_faces: np.ndarray) -> PeerResult:
     """Run one of `PEERS`.
 
     Args:

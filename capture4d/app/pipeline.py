@@ -14,9 +14,8 @@ __all__ = ["broken_limits", "parse_limits", "run_all", "run_demo", "run_report"]
 
 def run_demo(output: Path, *, workers: int, overwrite: bool = False) -> Path:
     """Synthesise `output`/capture, then run everything on it; the path of the report."""
-    from data_synth.stage import run as synthesise
-
     from data_synth.config import PRESETS
+    from data_synth.stage import run as synthesise
 
     synthesise(output / "capture", PRESETS["demo"], workers=workers, overwrite=overwrite)
     return run_all(output / "capture", output, RegistrationConfig(), workers=workers, overwrite=overwrite)
@@ -24,9 +23,8 @@ def run_demo(output: Path, *, workers: int, overwrite: bool = False) -> Path:
 
 def run_all(capture: Path, output: Path, config: RegistrationConfig, *, workers: int, overwrite: bool = False) -> Path:
     """Extract, register, report; the path of the report. Stages that are complete cost seconds."""
-    from registration.stage import run as register
-
     from capture4d.garment_stage import run as extract
+    from registration.stage import run as register
 
     extract(capture, output / "garment", workers=workers, overwrite=overwrite)
     register(capture, output / "garment", output / "registration", config, workers=workers, overwrite=overwrite)
