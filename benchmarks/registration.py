@@ -132,7 +132,9 @@ def _synthetic_take(quick: bool, workers: int) -> Path:
     from data_synth.cached_takes import cached_take
     from data_synth.config import PRESETS
 
-    return cached_take(replace(PRESETS["tiny"], frames=12) if quick else PRESETS["tshirt-200k"], workers=workers)
+    return cached_take(
+        replace(PRESETS["tiny"], frames=12, capture_every=1) if quick else PRESETS["tshirt-200k"], workers=workers
+    )
 
 
 def _scanned_diffcloth(output: Path, frames: int, workers: int) -> Path:

@@ -43,6 +43,10 @@ BLEND_FLOOR, BLEND_REACH = 0.001, 0.1
 """Metres: below the floor two predictions fit equally well; beyond the reach one is as bad as another."""
 
 
+COLD_SPACINGS = 1.3
+"""Distances below so many sample spacings of a scan say nothing about how far off a start is."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameResult:
     """One frame of the take, registered or flagged."""
@@ -218,7 +222,8 @@ def _choose(
         misfits["blended"] = scan.surface.tree.query(candidates["blended"][subset])[0]
     median = {name: float(np.median(misfits[name])) for name in candidates}
     name = min(median, key=lambda key: median[key])
-    return name, candidates[name], "cold" if distant or median[name] > config.sequence.cold_above else "warm"
+    near = max(config.sequence.cold_above, COLD_SPACINGS * scan.surface.spacing)
+    return name, candidates[name], "cold" if distant or median[name] > near else "warm"
 
 
 def _share_of_carried(analysis: TemplateAnalysis, carried: np.ndarray, previous: np.ndarray) -> np.ndarray:
