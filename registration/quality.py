@@ -31,6 +31,9 @@ Verdict = Literal["good", "check", "failed"]
 COVERED_SPACINGS = 2.5
 """A vertex has scan data if a scan point lies within this many scan spacings of it, measured along the surface."""
 
+BORDER_SEEN = 0.02
+"""A border vertex without a painted point this near, metres, lies where the scan does not show the border."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameQuality:
@@ -84,7 +87,8 @@ def border_distances(
 ) -> Float64[np.ndarray, " distances"]:
     """Distances, metres, from border vertices to painted points and from painted points to the border curve.
 
-    Points of one loop are compared with that loop where the paint tells.
+    Points of one loop are compared with that loop where the paint tells. Border vertices without painted points nearby
+    are left out: there the scan does not show the border. A border that is far from its paint is noticed by the paint.
     """
     border = analysis.border
     found: list[np.ndarray] = []
@@ -94,7 +98,8 @@ def border_distances(
         start, end = vertices[border.vertices[own]], vertices[border.after[own]]
         if not len(start) or not len(painted):
             continue
-        found.append(KDTree(painted).query(start)[0])
+        distances = np.asarray(KDTree(painted).query(start)[0])
+        found.append(distances[distances < BORDER_SEEN])
         steps = np.linspace(0.0, 1.0, 8, endpoint=False)[:, None, None]
         found.append(KDTree(((1.0 - steps) * start + steps * end).reshape(-1, 3)).query(painted)[0])
     return np.concatenate(found) if found else np.zeros(0)

@@ -84,3 +84,12 @@ def test_intersections_equal_brute_force() -> None:
     cut = {f for f in range(count) for g in range(count) if f != g and (pierces(f, g) or pierces(g, f))}
     assert 5 < len(cut) < count
     assert count_intersecting_faces(vertices, faces) == len(cut)
+
+
+def test_a_hidden_stretch_of_border_is_not_an_error(garment, scan_of, config) -> None:
+    scan = scan_of(straight_through)
+    seen = scan.boundary_points[:, 0] > 0
+    half = replace(scan, boundary_points=scan.boundary_points[seen], boundary_loops=scan.boundary_loops[seen])
+    analysis = analyse_template(garment, config)
+    quality = assess(analysis, prepare_frame(analysis, half, config), analysis.rest, QualityConfig())
+    assert quality.numbers["boundary_mean_mm"] < 3
