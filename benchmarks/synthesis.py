@@ -23,17 +23,9 @@ from capture4d.workdir import run_jobs
 from data_synth.cloth_quality import measure_cloth
 from data_synth.config import FABRICS, PRESETS, SynthConfig
 from data_synth.patterns import locate
-from data_synth.rig import bounding_sphere, capture_rig
-from data_synth.scanner import LABEL_BODY, LABEL_GARMENT, Surface, scan_surfaces
+from data_synth.scanner import LABEL_BODY, scan_surfaces
 from data_synth.simulation import dress, simulate
-from data_synth.stage import (
-    RIG_RADIUS_M,
-    Take,
-    dress_colours,
-    paint_garment,
-    prepare_take,
-    simulate_take,
-)
+from data_synth.stage import Take, prepare_take, simulate_take, take_rig, take_surfaces
 from data_synth.stage import run as synthesise
 from data_synth.wrinkle_relaxation import lift
 from registration.quality import count_intersecting_faces
@@ -221,16 +213,7 @@ def _hem_sag(take: Take, clip: list, frames: int) -> float:
 
 def _scans(take: Take, clip: list) -> dict[str, float]:
     extent = np.array([(fine.min(axis=0), fine.max(axis=0)) for _, _, fine in clip])
-    centre, radius = bounding_sphere(extent)
-    settings = take.config.scanner
-    rig = capture_rig(
-        centre=centre,
-        radius=max(radius, RIG_RADIUS_M),
-        cameras=settings.rig.cameras,
-        image_size=settings.rig.image_size,
-        field_of_view_deg=settings.rig.field_of_view_deg,
-    )
-    body_faces = take.shaped.body.template.faces
+    rig = take_rig(take.config, extent)
     vertices, accuracy, angles, holes, cpu = [], [], [], [], 0.0
     for index, _, fine in clip:
         surface = take.bodies[take.lead + index].vertices().astype(np.float32)
@@ -238,13 +221,8 @@ def _scans(take: Take, clip: list) -> dict[str, float]:
         started = time.process_time()
         scan, labels = scan_surfaces(
             rig,
-            [
-                Surface(truth, paint_garment(take.fine), LABEL_GARMENT, settings.fusion.garment_voxel_m),
-                Surface(
-                    Mesh(surface, body_faces), dress_colours(take.shaped), LABEL_BODY, settings.fusion.body_voxel_m
-                ),
-            ],
-            config=settings,
+            take_surfaces(take, fine, surface),
+            config=take.config.scanner,
             rng=np.random.default_rng([take.config.seed, index]),
         )
         cpu += time.process_time() - started

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
@@ -37,7 +38,7 @@ from data_synth.simulation import approach_poses, dress, simulate
 from data_synth.template import bind_template, carry
 from data_synth.wrinkle_relaxation import WrinkleMesh, relax_frame, wrinkle_mesh
 
-__all__ = ["Take", "prepare_take", "run", "simulate_take"]
+__all__ = ["Take", "prepare_take", "run", "simulate_take", "take_rig", "take_surfaces"]
 
 SCHEMA = 1
 GARMENT_COLOUR, BORDER_COLOUR = (47, 98, 201), (255, 196, 0)
@@ -114,7 +115,7 @@ def run(output: Path, config: SynthConfig, *, workers: int = 2, overwrite: bool 
     stage = open_stage(output, name="synth", schema=SCHEMA, config=config, upstream={}, overwrite=overwrite)
     frame_ids = list(range(1, config.frames + 1))
     if stage.pending(frame_ids, folder="truth"):
-        if stage.pending(frame_ids, folder="truth") and not (stage.path / "cloth" / "complete.json").exists():
+        if not (stage.path / "cloth" / "complete.json").exists():
             job = _SimulationJob(stage, config)
             list(
                 run_jobs(
@@ -131,8 +132,7 @@ def run(output: Path, config: SynthConfig, *, workers: int = 2, overwrite: bool 
     _write_quality(stage, frame_ids)
     files = [path for path in sorted(stage.path.rglob("*")) if path.is_file() and _belongs(stage, path)]
     digest = stage.finish(files)
-    for path in sorted((stage.path / "cloth").glob("*")):
-        path.unlink()
+    shutil.rmtree(stage.path / "cloth", ignore_errors=True)
     return digest
 
 
@@ -206,15 +206,7 @@ def _simulate(job: _SimulationJob) -> None:
         write_json(folder / "cloth" / f"{frame_id:06d}.json", asdict(quality))
         write_npz(folder / "cloth" / f"{frame_id:06d}.npz", vertices=fine, body=surface.astype(np.float32))
         extent.append((fine.min(axis=0), fine.max(axis=0)))
-    centre, radius = bounding_sphere(np.array(extent))
-    rig_config = config.scanner.rig
-    rig = capture_rig(
-        centre=centre,
-        radius=max(radius, RIG_RADIUS_M),
-        cameras=rig_config.cameras,
-        image_size=rig_config.image_size,
-        field_of_view_deg=rig_config.field_of_view_deg,
-    )
+    rig = take_rig(config, np.array(extent))
     save_rig(folder / "rig.json", rig)
     save_body(folder / "body.npz", take.shaped.body)
     save_poses(folder / "poses.npz", _measured_poses(take))
@@ -282,6 +274,29 @@ def dress_colours(shaped: ShapedBody) -> np.ndarray:
     return np.where(bare[:, None], SKIN_COLOUR, SUIT_COLOUR).astype(np.uint8)
 
 
+def take_rig(config: SynthConfig, extent: np.ndarray) -> Rig:
+    """The rig around a garment whose corners, (..., 3) metres, lie within `extent` all through the clip."""
+    centre, radius = bounding_sphere(extent)
+    rig = config.scanner.rig
+    return capture_rig(
+        centre=centre,
+        radius=max(radius, RIG_RADIUS_M),
+        cameras=rig.cameras,
+        image_size=rig.image_size,
+        field_of_view_deg=rig.field_of_view_deg,
+    )
+
+
+def take_surfaces(take: Take, fine: np.ndarray, surface: np.ndarray) -> list[Surface]:
+    """What the scanner sees of a frame: the painted garment, (V, 3), and the body in its suit, (B, 3); float32."""
+    fusion = take.config.scanner.fusion
+    faces = take.shaped.body.template.faces
+    return [
+        Surface(Mesh(fine, take.fine.faces), paint_garment(take.fine), LABEL_GARMENT, fusion.garment_voxel_m),
+        Surface(Mesh(surface, faces), dress_colours(take.shaped), LABEL_BODY, fusion.body_voxel_m),
+    ]
+
+
 _PREPARED: dict[SynthConfig, tuple[Take, Rig]] = {}
 """What a scanning process prepares once; a process serves one take."""
 
@@ -294,14 +309,9 @@ def _scan(job: _ScanJob) -> int:
     folder, frame_id, config = job.stage.path, job.frame_id, job.config
     with np.load(folder / "cloth" / f"{frame_id:06d}.npz", allow_pickle=False) as cloth:
         fine, surface = cloth["vertices"], cloth["body"]
-    fusion = config.scanner.fusion
-    garment = Surface(Mesh(fine, take.fine.faces), paint_garment(take.fine), LABEL_GARMENT, fusion.garment_voxel_m)
-    body = Surface(
-        Mesh(surface, take.shaped.body.template.faces), dress_colours(take.shaped), LABEL_BODY, fusion.body_voxel_m
-    )
     scan, labels = scan_surfaces(
         rig,
-        [garment, body],
+        take_surfaces(take, fine, surface),
         config=config.scanner,
         rng=np.random.default_rng([config.seed, 200, frame_id]),
         frame_id=frame_id,
