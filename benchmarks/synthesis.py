@@ -46,12 +46,12 @@ def run(*, quick: bool = False, frames: int = 120, workers: int = 2) -> list[Met
     """Simulate and scan takes of two fabrics with two seeds.
 
     Args:
-        quick: one small take of 24 frames, the same keys.
+        quick: one small take of 16 frames, the same keys.
         frames: frames of each take.
     """
     if quick:
-        small = replace(PRESETS["tiny"], frames=24, capture_every=2)
-        jobs = [_Job(small, 12, 16, 10)]
+        small = replace(PRESETS["tiny"], frames=16, capture_every=2)
+        jobs = [_Job(small, scan_every=8, converge_frames=10, late_start=6)]
     else:
         base = replace(PRESETS["tshirt-200k"], frames=frames)
         jobs = [
