@@ -1,4 +1,5 @@
 """Measure: `python -m benchmarks NAME [--quick] [--json FILE] [--gate] [options of the benchmark]`.
+`--list` prints the names.
 
 --quick measures the same keys on a smaller case; --json also writes the metrics to FILE; --gate exits with 1 if one
 is worse than benchmarks/baseline.json allows.
@@ -31,8 +32,10 @@ class Outlet:
 
 
 def main(arguments: list[str]) -> int:
-    modules = [module.name for module in pkgutil.iter_modules(benchmarks.__path__)]
-    names = [name for name in modules if name not in ("__main__", "metric", "peers")]
+    names = _names()
+    if arguments == ["--list"]:
+        print("\n".join(names))
+        return 0
     if not arguments or arguments[0] not in names:
         print(f"{__doc__}\nNAME is one of: {', '.join(names)}")
         return 0 if arguments in (["--help"], ["-h"]) else 2
