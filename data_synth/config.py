@@ -58,8 +58,12 @@ class Fabric:
 
 FABRICS = {
     "jersey": Fabric(),
-    "shirt-cotton": Fabric("shirt-cotton", density=0.13, coarse_bending=4e-5, fold_bending=0.15),
-    "linen": Fabric("linen", density=0.18, coarse_bending=5e-5, fold_bending=0.25, shrink=(0.91, 0.975)),
+    "shirt-cotton": Fabric(
+        "shirt-cotton", density=0.13, stretch_stiffness=130.0, coarse_bending=4e-5, fold_bending=0.15
+    ),
+    "linen": Fabric(
+        "linen", density=0.18, stretch_stiffness=180.0, coarse_bending=5e-5, fold_bending=0.25, shrink=(0.91, 0.975)
+    ),
 }
 
 
