@@ -27,7 +27,7 @@ from data_synth.scanner import LABEL_BODY, scan_surfaces
 from data_synth.simulation import dress, simulate
 from data_synth.stage import Take, prepare_take, simulate_take, take_rig, take_surfaces
 from data_synth.stage import run as synthesise
-from data_synth.wrinkle_relaxation import lift
+from data_synth.wrinkle_relaxation import lift, relax_frame
 from registration.quality import count_intersecting_faces
 
 OVERHEAD_COSINE = 0.5
@@ -82,6 +82,7 @@ def run(*, quick: bool = False, frames: int = 120, workers: int = 2) -> list[Met
         Metric("fine_vertices", least("fine_vertices"), "", "higher"),
         Metric("wrinkle_residual_deg", least("wrinkle_residual_deg"), "deg", "higher"),
         Metric("pose_determinism_ratio", worst("pose_determinism_ratio")),
+        Metric("fold_determinism_ratio", worst("fold_determinism_ratio")),
         Metric("flicker_ratio", worst("flicker_ratio")),
         Metric("stretch_p99", worst("stretch_p99")),
         Metric("stretch_p99_overhead", worst("stretch_p99_overhead")),
@@ -134,6 +135,7 @@ def _measure(job: _Job) -> dict[str, float]:
         **_scans(take, clip[job.scan_every // 2 :: job.scan_every]),
     }
     if job.late_start is not None:
+        row["fold_determinism_ratio"] = _fold_determinism(job, take, clip, normals) / residuals.mean()
         row["pose_determinism_ratio"] = _determinism(job, normals) / residuals.mean()
     if job.converge_frames:
         row["hem_sag_mm"] = _hem_sag(take, clip, job.converge_frames)
@@ -192,6 +194,20 @@ def _determinism(job: _Job, normals: dict[int, np.ndarray]) -> float:
     for index, _, fine in simulate_take(later):
         if fine is not None and index + first > first + (max(normals) - first) // 2:
             compared.append(_angles(vertex_normals(fine.astype(float), take.fine.faces), normals[index + first]).mean())
+    return float(np.mean(compared))
+
+
+def _fold_determinism(job: _Job, take: Take, clip: list, normals: dict[int, np.ndarray]) -> float:
+    """Mean angle, deg, to folds on the same coarse cloth that start anew a third of the way into the clip."""
+    assert job.late_start is not None
+    fabric, offsets, compared = FABRICS[take.config.fabric], None, []
+    late = clip[job.late_start :]
+    for index, coarse, _ in late:
+        surface = take.bodies[take.lead + index].vertices()
+        faces = take.shaped.body.template.faces
+        fine, offsets = relax_frame(take.wrinkles, coarse, surface, faces, offsets, fabric, take.config.relaxation)
+        if index > (late[0][0] + late[-1][0]) // 2:
+            compared.append(_angles(vertex_normals(fine.astype(float), take.fine.faces), normals[index]).mean())
     return float(np.mean(compared))
 
 

@@ -46,9 +46,9 @@ class Fabric:
     stretch_stiffness: float = 200.0
     """Membrane stiffness of the coarse sheet, N/m. Its own weight stretches a shirt by half a percent at 200; at 1000
     the solver is so far from converged that the hem hangs 26 mm too low."""
-    coarse_bending: float = 2e-5
+    coarse_bending: float = 5e-4
     """Bending stiffness of the coarse sheet, N m."""
-    friction: float = 0.25
+    friction: float = 0.05
     """Coulomb coefficient between cloth and body."""
     shrink: tuple[float, float] = (0.93, 0.98)
     """Size of the coarse rest pattern across and along the grain; the rest becomes fine folds."""
@@ -59,10 +59,10 @@ class Fabric:
 FABRICS = {
     "jersey": Fabric(),
     "shirt-cotton": Fabric(
-        "shirt-cotton", density=0.13, stretch_stiffness=130.0, coarse_bending=4e-5, fold_bending=0.15
+        "shirt-cotton", density=0.13, stretch_stiffness=130.0, coarse_bending=5e-4, fold_bending=0.15
     ),
     "linen": Fabric(
-        "linen", density=0.18, stretch_stiffness=180.0, coarse_bending=5e-5, fold_bending=0.25, shrink=(0.91, 0.975)
+        "linen", density=0.18, stretch_stiffness=180.0, coarse_bending=5e-4, fold_bending=0.25, shrink=(0.91, 0.975)
     ),
 }
 
@@ -86,9 +86,16 @@ class SimulationConfig:
     rest_frames: int = 14
     """Frames at rest before the clip starts."""
     contact_gap_m: float = 0.008
-    damping: float = 0.9994
+    damping: float = 0.97
     """Share of the velocity kept each substep."""
     calm_damping: float = 0.85
+    hold_hz: float = 12.0
+    """Frequency at which a vertex at the shoulders would swing about its place on the body: how firmly the shirt keeps
+    its seat. 0 leaves the sheet free, and its folds at the shoulders to its history."""
+    hold_depth_m: float = 0.15
+    """How far below the shoulders the hold has fallen to a third of the way to `hold_floor`."""
+    hold_floor: float = 0.1
+    """Share of the hold far below the shoulders."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +104,7 @@ class RelaxationConfig:
 
     vertices: int = 80_000
     """Vertices of the wrinkle mesh."""
-    sweeps: int = 45
+    sweeps: int = 36
     """Gauss-Seidel sweeps a frame. Fewer let the folds lag behind the pose a little, which calms them."""
     start_sweeps_factor: int = 8
     """How many times more where there is no frame before."""
@@ -109,7 +116,7 @@ class RelaxationConfig:
     """No vertex leaves the coarse sheet farther than this."""
     body_margin_m: float = 0.003
     """Clearance to the body."""
-    warm_start: float = 0.93
+    warm_start: float = 0.935
     """Share of the folds carried over from the frame before; the rest is the imperfection. 1 moves most smoothly, but
     then the folds are an accident of the start; below 0.5 they shimmer."""
     imperfection_m: float = 0.003

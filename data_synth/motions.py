@@ -26,7 +26,7 @@ __all__ = ["make_motion", "pose_sequence", "sample_poses", "scripted_clip"]
 Keyframe = tuple[float, dict[str, float]]
 """Time in seconds, and controls in degrees; a control that is not named keeps its last value, 0 at the start."""
 
-HANGING, OVERHEAD = -31.0, 116.0
+HANGING, OVERHEAD = -28.0, 116.0
 """Lateral arm raise from the rest pose, whose arms point about 49 degrees below the horizontal."""
 
 CLIPS: dict[str, list[Keyframe]] = {

@@ -18,7 +18,7 @@ class RigConfig:
 
     cameras: int = 48
     """How many; 20 to 48 are sensible."""
-    image_size: int = 512
+    image_size: int = 560
     """Width and height of the square images, pixels."""
     field_of_view_deg: float = 48.0
     """Full horizontal angle of view."""
@@ -36,7 +36,7 @@ class NoiseConfig:
     """Width of the Gaussian that correlates neighbouring pixels, as stereo matching windows do."""
     grazing_floor: float = 0.25
     """Noise grows with 1/cos of the angle to the surface normal, down to this cosine."""
-    silhouette_step_m: float = 0.012
+    silhouette_step_m: float = 0.013
     """A larger step of depth between neighbouring pixels is a silhouette: both sides are lost."""
     silhouette_loss: float = 0.5
     """Share of the next two pixels that is lost as well, in blobs."""

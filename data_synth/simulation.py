@@ -11,18 +11,20 @@ References: Chen et al., Vertex Block Descent (SIGGRAPH 2024); the shrunk patter
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation, Slerp
 
-from capture4d.body import PosedBody, ShapedBody, with_pose
+from capture4d.body import PosedBody, ShapedBody, skin, unskin, with_pose
 from capture4d.open3d_loading import import_open3d
 from capture4d.types import PoseSequence
 from capture4d.warp_loading import import_warp
 from data_synth.config import Fabric, SimulationConfig
 from data_synth.patterns import PanelMesh, Pattern
+from data_synth.template import bind
 
 __all__ = ["approach_poses", "dress", "simulate"]
 
@@ -151,10 +153,15 @@ def simulate(
     state, scratch = model.state(), model.state()
     step = 1 / config.fps / config.substeps
     gravity = np.array([0.0, -9.81, 0.0], np.float32)
+    hold: _Hold | None = None
     yield start
     current = bodies[0].vertices()
     for frame in range(1, len(bodies)):
         previous, current = current, bodies[frame].vertices()
+        if frame == config.calm_frames and config.hold_hz > 0:
+            cloth = state.particle_q.numpy().astype(np.float64)
+            hold = _Hold.take(mesh, cloth, bodies[frame - 1], model.particle_mass.numpy(), config)
+        held = None if hold is None else (hold.places(bodies[frame - 1]), hold.places(bodies[frame]))
         calm = frame <= config.calm_frames
         model.set_gravity(tuple(gravity * (0.5 if calm else 1.0)))
         for substep in range(config.substeps):
@@ -164,12 +171,49 @@ def simulate(
             if body.mesh.velocities is not None:
                 body.mesh.velocities.assign(((current - previous) * config.fps).astype(np.float32))
             state.clear_forces()
+            if hold is not None and held is not None:
+                places = (1 - blend) * held[0] + blend * held[1]
+                state.particle_f.assign((hold.stiffness * (places - state.particle_q.numpy())).astype(np.float32))
             pipeline.collide(state, contacts)
             solver.step(state, scratch, control, contacts, step)
             state, scratch = scratch, state
             keep = config.calm_damping if calm else config.damping
             state.particle_qd.assign(state.particle_qd.numpy() * np.float32(keep))
         yield state.particle_q.numpy().astype(np.float64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Hold:
+    """Soft springs from the cloth to where it sat on the body when it was put on.
+
+    They stand for what keeps a worn shirt in place, the seams and the stiffness of the yoke, and they are why a take
+    depends on the pose and hardly on how it was reached: where friction lets the cloth stick, and where it buckles
+    when the arms go up, a free sheet has as many answers as histories.
+    """
+
+    rest: np.ndarray
+    """(V, 3) in the body's rest pose, metres."""
+    skin_weights: np.ndarray
+    """(V, J)."""
+    stiffness: np.ndarray
+    """(V, 1) spring constants, N/m."""
+
+    @staticmethod
+    def take(
+        mesh: PanelMesh, cloth: np.ndarray, body: PosedBody, masses: np.ndarray, config: SimulationConfig
+    ) -> _Hold:
+        """Hold the cloth, (V, 3) with limbs well apart, where it is on the body now; firmest at the shoulders."""
+        _, _, weights = bind(mesh, cloth, body)
+        rest, flagged = unskin(cloth, weights, body.transforms)
+        assert not flagged.any(), "the dressing pose cannot be unposed"
+        shoulder = body.shaped.joints[body.shaped.body.joint_names.index("upperarm01.L")]
+        below = np.maximum(shoulder[1] - rest[:, 1], 0) / config.hold_depth_m
+        share = config.hold_floor + (1 - config.hold_floor) * np.exp(-(below**2))
+        return _Hold(rest, weights, ((2 * np.pi * config.hold_hz) ** 2 * share * masses)[:, None])
+
+    def places(self, body: PosedBody) -> np.ndarray:
+        """Where the springs end in a pose, (V, 3) metres."""
+        return skin(self.rest, self.skin_weights, body.transforms)
 
 
 def _build_model(mesh: PanelMesh, start: np.ndarray, bodies: Sequence[PosedBody], fabric: Fabric) -> tuple[Any, Any]:

@@ -24,6 +24,22 @@ def carry(source: PanelMesh, target: PanelMesh, positions: np.ndarray) -> np.nda
     return np.einsum("vk,vkc->vc", weights, positions[source.faces[faces]])
 
 
+def bind(mesh: PanelMesh, dressed: np.ndarray, body: PosedBody) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The nearest body point of each vertex, (V,) faces and (V, 3) barycentrics, and smooth skin weights (V, J).
+
+    Args:
+        dressed: (V, 3) vertices in a pose where the limbs are well apart.
+    """
+    scene = import_open3d().t.geometry.RaycastingScene(nthreads=1)
+    body_faces = body.shaped.body.template.faces
+    scene.add_triangles(body.vertices().astype(np.float32), body_faces.astype(np.uint32))
+    closest = scene.compute_closest_points(dressed.astype(np.float32))
+    faces, uv = closest["primitive_ids"].numpy().astype(np.int32), closest["primitive_uvs"].numpy()
+    barycentric = np.column_stack([1 - uv.sum(axis=1), uv]).astype(np.float32)
+    weights = np.einsum("vk,vkj->vj", barycentric, body.shaped.body.skin_weights[body_faces[faces]])
+    return faces, barycentric, _diffuse(weights, mesh)
+
+
 def bind_template(
     mesh: PanelMesh, dressed: np.ndarray, dressed_body: PosedBody, settled: np.ndarray, settled_body: PosedBody
 ) -> Garment:
@@ -33,14 +49,7 @@ def bind_template(
         dressed: (V, 3) vertices in the dressing pose, arms held out.
         settled: (V, 3) vertices in the pose the clip starts with.
     """
-    body = dressed_body.shaped.body
-    scene = import_open3d().t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(dressed_body.vertices().astype(np.float32), body.template.faces.astype(np.uint32))
-    closest = scene.compute_closest_points(dressed.astype(np.float32))
-    faces, uv = closest["primitive_ids"].numpy().astype(np.int32), closest["primitive_uvs"].numpy()
-    barycentric = np.column_stack([1 - uv.sum(axis=1), uv]).astype(np.float32)
-    weights = np.einsum("vk,vkj->vj", barycentric, body.skin_weights[body.template.faces[faces]])
-    weights = _diffuse(weights, mesh)
+    faces, barycentric, weights = bind(mesh, dressed, dressed_body)
     rest, flagged = unskin(settled, weights, settled_body.transforms)
     assert not flagged.any(), "the clip's first pose cannot be unposed"
     return Garment(

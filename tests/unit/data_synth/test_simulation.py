@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -58,6 +60,21 @@ def test_equal_input_gives_equal_bits(simulated) -> None:
     mesh, bodies, start, frames = simulated
     again = list(simulate(mesh, start, bodies[:6], Fabric(), SETTINGS))
     np.testing.assert_array_equal(np.array(again), np.array(frames[:6]))
+
+
+def _height_after(mesh, start, bodies, **settings) -> float:
+    *_, cloth = simulate(mesh, start, bodies, Fabric(), replace(SETTINGS, **settings))
+    return float(cloth[mesh.loops["hem"], 1].mean())
+
+
+@pytest.mark.slow
+def test_the_hold_carries_the_hem(simulated) -> None:
+    mesh, bodies, start, _ = simulated
+    bodies = bodies[: SETTINGS.calm_frames + 1] * 2
+    free = _height_after(mesh, start, bodies, hold_hz=0.0)
+    loose = _height_after(mesh, start, bodies, hold_hz=6.0, hold_floor=0.1)
+    firm = _height_after(mesh, start, bodies, hold_hz=6.0, hold_floor=1.0)
+    assert free < loose < firm
 
 
 @pytest.mark.slow
