@@ -50,9 +50,8 @@ def require_connected(views: Sequence[BoardView], names: Sequence[str]) -> None:
         blind = ", ".join(name for name, count in zip(names, counts, strict=True) if count == 0)
         raise InputError(f"images: expected the board in images of every camera, found none of {blind}")
     if (counts < LEAST_VIEWS).any():
-        few = ", ".join(
-            f"{names[camera]} ({counts[camera]})" for camera in np.flatnonzero(counts < LEAST_VIEWS).tolist()
-        )
+        short = np.flatnonzero(counts < LEAST_VIEWS).tolist()
+        few = ", ".join(f"{names[camera]} ({counts[camera]})" for camera in short)
         raise InputError(f"images: expected at least {LEAST_VIEWS} poses with the board per camera, found {few}")
     groups = _groups(views)
     if len(groups) > 1:

@@ -31,7 +31,7 @@ BLACK = -1
 class BoardImageConfig:
     """What stands between the board and the pixels."""
 
-    rays_per_side: int = 4
+    rays_per_side: int = 3
     """Squared: rays averaged in a pixel."""
     blur_px: float = 0.7
     """Standard deviation of the lens's blur."""

@@ -32,13 +32,14 @@ def calibration_rig(
     distance_m: float = 2.4,
     image_size: tuple[int, int] = (2048, 1536),
     focal_px: float = 2000.0,
+    arc_deg: float = 360.0,
 ) -> Rig:
-    """Cameras in three rings about the volume, no two lenses alike, none mounted quite as planned."""
+    """Cameras in three rings, or arcs, about the volume, no two lenses alike, none mounted quite as planned."""
     heights = np.array([-0.9, 0.0, 0.9])
     transforms = []
     for index in range(cameras):
         ring = index % 3
-        azimuth = 2 * np.pi * index / cameras + 0.1 * rng.normal()
+        azimuth = np.radians(arc_deg) * (index / cameras) + 0.1 * rng.normal()
         level = np.sqrt(distance_m**2 - heights[ring] ** 2)
         eye = np.array([level * np.sin(azimuth), heights[ring], level * np.cos(azimuth)])
         target = 0.1 * rng.normal(size=3)
@@ -61,11 +62,13 @@ def calibration_rig(
     )
 
 
-def wave_board(board: Board, count: int, *, rng: np.random.Generator) -> Float64[np.ndarray, "poses 4 4"]:
-    """T_world_board of a board held anywhere in the volume, facing anywhere but straight down."""
+def wave_board(
+    board: Board, count: int, *, rng: np.random.Generator, arc_deg: float = 360.0
+) -> Float64[np.ndarray, "poses 4 4"]:
+    """T_world_board of a board held anywhere in the volume, facing anywhere in the arc, or up, or a little down."""
     poses = np.tile(np.eye(4), (count, 1, 1))
     for pose in poses:
-        azimuth, rise = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(-35, 50))
+        azimuth, rise = np.radians(rng.uniform(0, arc_deg)), np.radians(rng.uniform(-35, 50))
         away = -np.array([np.sin(azimuth) * np.cos(rise), np.sin(rise), np.cos(azimuth) * np.cos(rise)])
         x = np.cross((0.0, -1.0, 0.0), away)
         x /= np.linalg.norm(x)
