@@ -27,11 +27,11 @@ class CalibrationConfig:
 class RigCheckConfig:
     """When a camera counts as moved."""
 
-    false_alarms: float = 2e-3
+    false_alarms: float = 2e-4
     """Share of checks of an untouched rig that may blame a camera."""
-    floor_mm: float = 0.02
+    floor_mm: float = 0.03
     """Standard deviation granted to every camera beyond its own: real lenses are not quite their model."""
-    floor_deg: float = 0.0005
+    floor_deg: float = 0.001
     """The same for its direction."""
 
 

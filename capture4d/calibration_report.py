@@ -20,7 +20,7 @@ from capture4d.projection import rotation_angle_deg, transform, triangulate
 from capture4d.rig_adjustment import RigEstimate, adjust_rig, view_residuals
 from capture4d.rig_calibration import Calibration
 from capture4d.rig_start import require_connected
-from capture4d.rig_uncertainty import centre_sigma_m, fit_board
+from capture4d.rig_uncertainty import camera_blocks, centre_sigma_m, fit_board
 
 __all__ = ["calibration_report", "coverage_grid", "rig_difference", "rigid_alignment"]
 
@@ -101,9 +101,9 @@ def rig_difference(
 
 
 def _cameras(calibration: Calibration, board: Board) -> tuple[list[dict[str, Any]], list[np.ndarray]]:
-    estimate, covariances = calibration.estimate, calibration.covariances
-    sigmas = 1e3 * centre_sigma_m(covariances)
-    turns = np.degrees(np.sqrt(np.trace(covariances[:, 8:11, 8:11], axis1=1, axis2=2)))
+    estimate, blocks = calibration.estimate, camera_blocks(calibration.covariance)
+    sigmas = 1e3 * centre_sigma_m(calibration.covariance)
+    turns = np.degrees(np.sqrt(np.trace(blocks[:, 8:11, 8:11], axis1=1, axis2=2)))
     rows, grids = [], []
     for camera in range(len(estimate.rig.names)):
         own = [view for view in calibration.views if view.camera == camera]
@@ -123,9 +123,8 @@ def _cameras(calibration: Calibration, board: Board) -> tuple[list[dict[str, Any
                 "tilt_most_deg": max(tilts),
                 "centre_sigma_mm": float(sigmas[camera]),
                 "rotation_sigma_deg": float(turns[camera]),
-                "focal_sigma_px": float(np.sqrt(covariances[camera, 0, 0])),
+                "focal_sigma_px": float(np.sqrt(blocks[camera, 0, 0])),
                 "coverage": grid.astype(int).tolist(),
-                "covariance": covariances[camera].tolist(),
             }
         )
     return rows, grids

@@ -28,7 +28,7 @@ __all__ = ["BoardImage", "convert", "find_images", "run", "run_check"]
 
 PATTERN = "{camera}/{pose}"
 ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
-REPORT, CORNERS = "calibration.json", "calibration_corners.npz"
+REPORT, CORNERS, COVARIANCE = "calibration.json", "calibration_corners.npz", "calibration_covariance.npz"
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +91,7 @@ def run(
         write_model(colmap, calibration.estimate.rig)
     report = calibration_report(calibration, geometry, pose_names=poses, config=config)
     report = {"format": 1, "board": board, "images": len(found), "config": dataclasses.asdict(config), **report}
+    write_npz(output.with_name(COVARIANCE), names=np.array(names), covariance=calibration.covariance)
     write_json(output.with_name(REPORT), report)
     return report
 
@@ -130,8 +131,8 @@ def run_check(
         if detection.size != (width, height):
             seen = "x".join(str(size) for size in detection.size)
             raise InputError(f"{detection.image.path}: expected {width}x{height} pixels as in the rig, found {seen}")
-    covariances = _covariances(beside, report, rig.names)
-    return check_rig(rig, _views(detections, rig.names, poses), geometry, covariances=covariances, config=config)
+    covariance = _read_covariance(rig_path.with_name(COVARIANCE), rig.names)
+    return check_rig(rig, _views(detections, rig.names, poses), geometry, covariance=covariance, config=config)
 
 
 def convert(source: Path, output: Path, *, text: bool = False) -> None:
@@ -266,15 +267,19 @@ def _views(detections: Sequence[_Detection], names: Sequence[str], poses: Sequen
     ]
 
 
-def _covariances(path: Path, report: dict[str, Any], names: Sequence[str]) -> np.ndarray | None:
-    """Of the calibration, if it is that of these cameras."""
-    rows = {row["name"]: row for row in report.get("cameras", [])}
-    if set(rows) != set(names):
+def _read_covariance(path: Path, names: Sequence[str]) -> np.ndarray | None:
+    """Of the calibration, (C, 14, C, 14), if it is that of these cameras."""
+    if not path.is_file():
         return None
-    covariances = np.array([rows[name].get("covariance") for name in names], np.float64)
-    if covariances.shape != (len(names), CAMERA_UNKNOWNS, CAMERA_UNKNOWNS):
-        raise InputError(f"{path}: expected a covariance of {CAMERA_UNKNOWNS} numbers squared for every camera")
-    return covariances
+    with ArrayFile(path) as arrays:
+        if arrays.names("names") != tuple(names):
+            return None
+        covariance = arrays["covariance"]
+    if covariance.shape != (len(names), CAMERA_UNKNOWNS) * 2:
+        raise InputError(
+            f"{path}: expected {len(names)} x {CAMERA_UNKNOWNS} unknowns squared, found {covariance.shape}"
+        )
+    return covariance
 
 
 def _natural(name: str) -> list[tuple[int, int | str]]:

@@ -191,8 +191,8 @@ def rotation_from_vector(vector: Float64[np.ndarray, " 3"]) -> Float64[np.ndarra
     return np.eye(3) + np.sin(angle) * axis + (1 - np.cos(angle)) * axis @ axis
 
 
-def rotation_angle_deg(rotations: Float64[np.ndarray, "*batch 3 3"]) -> Float64[np.ndarray, "*batch"]:
-    """Angle of a rotation, exact for small ones too."""
+def rotation_angle_deg(rotations: Float64[np.ndarray, "turns 3 3"]) -> Float64[np.ndarray, " turns"]:
+    """Angles of rotations, exact for small ones too."""
     skew = rotations - np.swapaxes(rotations, -1, -2)
     sine = np.linalg.norm(np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], axis=-1), axis=-1)
     return np.degrees(np.arctan2(sine, np.trace(rotations, axis1=-2, axis2=-1) - 1))

@@ -13,7 +13,7 @@ from capture4d.calibration_board import Board, BoardView
 from capture4d.calibration_config import CALIBRATION, CalibrationConfig
 from capture4d.rig_adjustment import RigEstimate, adjust_rig, view_residuals
 from capture4d.rig_start import require_connected, start_rig, usable_views
-from capture4d.rig_uncertainty import camera_covariances, robust_scale
+from capture4d.rig_uncertainty import camera_covariance, robust_scale
 
 __all__ = ["Calibration", "calibrate_rig", "final_loss", "level_world"]
 
@@ -31,8 +31,8 @@ class Calibration:
     start: RigEstimate
     views: Sequence[BoardView]
     """Those that were used."""
-    covariances: Float64[np.ndarray, "cameras 14 14"]
-    """Of each camera's fx fy cx cy k1 k2 p1 p2 and the twist (radians, metres) of its axes."""
+    covariance: Float64[np.ndarray, "cameras 14 cameras 14"]
+    """Of every camera's fx fy cx cy k1 k2 p1 p2 and the twist (radians, metres) of its axes."""
     noise_px: float
     """Standard deviation of a coordinate of a detected corner."""
     loss_px: float
@@ -72,7 +72,7 @@ def calibrate_rig(
         estimate=level_world(estimate, middle, used, floor=floor),
         start=level_world(start, middle, used, floor=floor),
         views=used,
-        covariances=camera_covariances(estimate, used, loss_px=loss_px),
+        covariance=camera_covariance(estimate, used, loss_px=loss_px),
         noise_px=robust_scale(residuals),
         loss_px=loss_px,
         adjust_cpu_s=adjust_cpu_s,

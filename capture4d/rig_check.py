@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Literal
 
 import cv2
@@ -71,27 +72,28 @@ def check_rig(
     views: Sequence[BoardView],
     board: Board,
     *,
-    covariances: Float64[np.ndarray, "cameras 14 14"] | None = None,
+    covariance: Float64[np.ndarray, "cameras 14 cameras 14"] | None = None,
     config: RigCheckConfig = RIG_CHECK,
 ) -> list[CameraCheck]:
     """Test every camera of a rig.
 
     Args:
         views: of one pose of the board, or several.
-        covariances: of the calibration, from `camera_covariances`; without them only the config's floor counts.
+        covariance: of the calibration, from `camera_covariance`; without them only the config's floor counts.
     Raises:
         InputError: no pose is seen by three cameras.
     """
     used = _seen_together(usable_views(views, board))
     if not used:
         raise InputError(f"images: expected a pose of the board that {LEAST_CAMERAS} cameras see, found none")
-    if covariances is None:
-        covariances = np.zeros((len(rig.names), CAMERA_UNKNOWNS, CAMERA_UNKNOWNS))
+    if covariance is None:
+        covariance = np.zeros((len(rig.names), CAMERA_UNKNOWNS) * 2)
+    known = covariance
     scene = _scene(rig, used, board)
     limit = float(chi2.isf(config.false_alarms / len({view.camera for view in used}), 6))
 
     def movement(camera: int, trusted: set[int]) -> _Movement | None:
-        return _movement(scene, camera, trusted - {camera}, covariances, limit, config)
+        return _movement(scene, camera, trusted - {camera}, known, limit, config)
 
     def discord(trusted: set[int]) -> float:
         found = [movement(camera, trusted) for camera in sorted(trusted)]
@@ -109,6 +111,8 @@ class _Scene:
 
     estimate: RigEstimate
     views: Sequence[BoardView]
+    cameras: Mapping[int, frozenset[int]]
+    """Which cameras see the board, by pose."""
     noise: Mapping[tuple[int, int], float]
     """Variance of a coordinate, square pixels, for each camera and pose: a steep or blurred view has more."""
     loss_px: float
@@ -133,7 +137,8 @@ def _scene(rig: Rig, views: Sequence[BoardView], board: Board) -> _Scene:
         residuals[view.camera, view.pose] = system.residuals
     loss_px = max(LOSS_SIGMAS * robust_scale(np.concatenate(list(residuals.values()))), LEAST_LOSS_PX)
     noise = {key: noise_of(left, loss_px) * len(left) / max(len(left) - 3, 1) for key, left in residuals.items()}
-    return _Scene(estimate, views, noise, loss_px)
+    cameras = {pose: frozenset(view.camera for view in views if view.pose == pose) for pose in {v.pose for v in views}}
+    return _Scene(estimate, views, cameras, noise, loss_px)
 
 
 def _place_board(rig: Rig, view: BoardView, board: Board) -> Float64[np.ndarray, "4 4"]:
@@ -149,16 +154,16 @@ def _movement(
     scene: _Scene,
     camera: int,
     witnesses: set[int],
-    covariances: Float64[np.ndarray, "cameras 14 14"],
+    calibrated: Float64[np.ndarray, "cameras 14 cameras 14"],
     limit: float,
     config: RigCheckConfig,
 ) -> _Movement | None:
     """How a camera has moved, if the witnesses have not; None if none of them sees a board that it sees."""
     own, boards = [], []
     for view in scene.views:
-        others = [v for v in scene.views if v.pose == view.pose and v.camera in witnesses]
+        others = frozenset(witnesses & scene.cameras[view.pose])
         if view.camera == camera and others:
-            board = _witnessed_board(scene, others)
+            board = _witnessed_board(scene, view.pose, others)
             own.append(linearise(board.estimate, view))
             boards.append(board)
     if not own:
@@ -171,15 +176,15 @@ def _movement(
     plain = np.linalg.solve(J.T @ J, J.T)
     covariance = (plain * noise) @ plain.T
     covariance += np.diag(np.repeat([np.radians(config.floor_deg) ** 2, (config.floor_mm / 1e3) ** 2], 3))
-    influence = {camera: solver @ by_camera}
+    influence = np.zeros((6, *calibrated.shape[:2]))
+    influence[:, camera] = solver @ by_camera
     ends = np.cumsum([system.residuals.size for system in own])
     for system, board, end in zip(own, boards, ends, strict=True):
         by_board = solver[:, end - system.residuals.size : end] @ system.by_board.reshape(-1, 6)
         covariance += by_board @ board.covariance @ by_board.T
         for witness, influenced in board.by_witness.items():
-            influence[witness] = influence.get(witness, 0) + by_board @ influenced
-    for witness, by_unknowns in influence.items():
-        covariance += by_unknowns @ covariances[witness] @ by_unknowns.T
+            influence[:, witness] += by_board @ influenced
+    covariance += np.einsum("icq,cqdr,jdr->ij", influence, calibrated, influence, optimize=True)
     score = float(twist @ np.linalg.solve(covariance, twist)) / limit
     shift_px = float(np.sqrt(2 * ((J @ twist) ** 2).mean()))
     return _Movement(twist, covariance, shift_px, score)
@@ -194,8 +199,11 @@ class _WitnessedBoard:
     """What an error in a witness's calibration does to the board's twist."""
 
 
-def _witnessed_board(scene: _Scene, views: Sequence[BoardView]) -> _WitnessedBoard:
-    estimate, systems, pose = scene.estimate, [], views[0].pose
+@lru_cache(maxsize=256)
+def _witnessed_board(scene: _Scene, pose: int, witnesses: frozenset[int]) -> _WitnessedBoard:
+    """Where some cameras say the board was at one pose."""
+    views = [view for view in scene.views if view.pose == pose and view.camera in witnesses]
+    estimate, systems = scene.estimate, []
     for loss_px in (*FIT_LOSSES_PX, scene.loss_px):
         placed, systems = fit_board(estimate, views, loss_px=loss_px)
         poses = estimate.T_world_board.copy()

@@ -32,7 +32,8 @@ from capture4d.rig_adjustment import RigEstimate, view_residuals
 __all__ = [
     "CAMERA_UNKNOWNS",
     "ViewSystem",
-    "camera_covariances",
+    "camera_blocks",
+    "camera_covariance",
     "centre_sigma_m",
     "fit_board",
     "linearise",
@@ -81,10 +82,10 @@ def noise_of(residuals: Float64[np.ndarray, "corners 2"], loss_px: float) -> flo
     return float(0.5 * (weights**2 * squared).mean() / (weights**2).mean() ** 2)
 
 
-def camera_covariances(
+def camera_covariance(
     estimate: RigEstimate, views: Sequence[BoardView], *, loss_px: float
-) -> Float64[np.ndarray, "cameras 14 14"]:
-    """Covariance of the unknowns of each camera."""
+) -> Float64[np.ndarray, "cameras 14 cameras 14"]:
+    """Covariance of the unknowns of all cameras."""
     count = len(estimate.rig.names)
     size = CAMERA_UNKNOWNS * count
     information = np.zeros((size, size))
@@ -105,14 +106,18 @@ def camera_covariances(
     information += gauge.T @ gauge / GAUGE_M**2
     scale = 1 / np.sqrt(np.diag(information))
     covariance = np.linalg.inv(information * scale[:, None] * scale) * scale[:, None] * scale
-    blocks = covariance.reshape(count, CAMERA_UNKNOWNS, count, CAMERA_UNKNOWNS)
-    own = blocks[np.arange(count), :, np.arange(count)]
-    return (own + np.swapaxes(own, 1, 2)) / 2
+    return ((covariance + covariance.T) / 2).reshape(count, CAMERA_UNKNOWNS, count, CAMERA_UNKNOWNS)
 
 
-def centre_sigma_m(covariances: Float64[np.ndarray, "cameras 14 14"]) -> Float64[np.ndarray, " cameras"]:
+def camera_blocks(covariance: Float64[np.ndarray, "cameras 14 cameras 14"]) -> Float64[np.ndarray, "cameras 14 14"]:
+    """The part of each camera on its own."""
+    each = np.arange(len(covariance))
+    return covariance[each, :, each]
+
+
+def centre_sigma_m(covariance: Float64[np.ndarray, "cameras 14 cameras 14"]) -> Float64[np.ndarray, " cameras"]:
     """Standard deviation of the place of each camera: root mean square distance, metres."""
-    return np.sqrt(np.trace(covariances[:, -3:, -3:], axis1=1, axis2=2))
+    return np.sqrt(np.trace(camera_blocks(covariance)[:, -3:, -3:], axis1=1, axis2=2))
 
 
 def fit_board(

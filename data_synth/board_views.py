@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int32
 
 from capture4d.calibration_board import Board, BoardView, detect_corners
 from capture4d.projection import project_world, rotation_from_vector, transform
@@ -15,7 +15,7 @@ from capture4d.types import Rig
 from data_synth.board_images import DEFAULT, BoardImageConfig, photograph_board
 from data_synth.rig import look_at
 
-__all__ = ["calibration_rig", "measure_corner_errors", "simulate_views", "wave_board"]
+__all__ = ["calibration_rig", "measure_corner_errors", "simulate_views", "visible_corners", "wave_board"]
 
 VOLUME_M = (1.2, 1.8, 1.2)
 """Width, height and depth of the volume, about its centre."""
@@ -90,20 +90,26 @@ def simulate_views(
     """Detections of every camera at every pose; each view takes its errors from one image of the pool."""
     views = []
     for pose, T_world_board in enumerate(poses):
-        points = transform(T_world_board, board.corners)
-        middle = transform(T_world_board, board.middle[None])[0]
         for camera in range(len(rig.names)):
-            sight = middle - rig.centres[camera]
-            if T_world_board[:3, 2] @ sight < STEEPEST_COSINE * np.linalg.norm(sight):
-                continue
-            pixels, seen = project_world(rig, camera, points)
-            ids = np.flatnonzero(seen)
-            if len(ids) < SMALLEST_VIEW:
-                continue
-            pool = errors[rng.integers(len(errors))]
-            noisy = pixels[ids] + pool[rng.integers(len(pool), size=len(ids))]
-            views.append(BoardView(camera, pose, ids.astype(np.int32), noisy))
+            ids, pixels = visible_corners(rig, camera, board, T_world_board)
+            if len(ids):
+                pool = errors[rng.integers(len(errors))]
+                noisy = pixels + pool[rng.integers(len(pool), size=len(ids))]
+                views.append(BoardView(camera, pose, ids, noisy))
     return views
+
+
+def visible_corners(
+    rig: Rig, camera: int, board: Board, T_world_board: Float64[np.ndarray, "4 4"]
+) -> tuple[Int32[np.ndarray, " seen"], Float64[np.ndarray, "seen 2"]]:
+    """Ids and true pixels of the corners a camera sees; none if the board is too steep, or nearly out of the image."""
+    sight = transform(T_world_board, board.middle[None])[0] - rig.centres[camera]
+    pixels, seen = project_world(rig, camera, transform(T_world_board, board.corners))
+    facing = T_world_board[:3, 2] @ sight >= STEEPEST_COSINE * np.linalg.norm(sight)
+    ids = np.flatnonzero(seen & facing)
+    if len(ids) < SMALLEST_VIEW:
+        ids = ids[:0]
+    return ids.astype(np.int32), pixels[ids]
 
 
 def measure_corner_errors(
@@ -118,17 +124,12 @@ def measure_corner_errors(
     """Detected less true corners, pixels, of rendered images of a rig: one array an image that shows the board."""
     pool = []
     for pose in poses:
-        points = transform(pose, board.corners)
-        for camera in rng.permutation(len(rig.names)):
-            pixels, seen = project_world(rig, int(camera), points)
-            sight = transform(pose, board.middle[None])[0] - rig.centres[camera]
-            if seen.sum() < SMALLEST_VIEW or pose[:3, 2] @ sight < STEEPEST_COSINE * np.linalg.norm(sight):
-                continue
-            image = photograph_board(rig, int(camera), board, pose, rng=rng, config=config)
-            ids, found = detect_corners(image, board)
-            if len(ids) >= SMALLEST_VIEW:
-                pool.append(found - pixels[ids])
-            if len(pool) == images:
-                return pool
-            break
+        seeing = [c for c in range(len(rig.names)) if len(visible_corners(rig, c, board, pose)[0])]
+        if not seeing or len(pool) == images:
+            continue
+        camera = int(rng.choice(seeing))
+        found, pixels = detect_corners(photograph_board(rig, camera, board, pose, rng=rng, config=config), board)
+        everywhere, _ = project_world(rig, camera, transform(pose, board.corners))
+        if len(found) >= SMALLEST_VIEW:
+            pool.append(pixels - everywhere[found])
     return pool
