@@ -48,7 +48,7 @@ def shoot(tmp_path_factory: pytest.TempPathFactory):
     rng = np.random.default_rng(6)
     board = parse_board(SPEC)
     rig = calibration_rig(CAMERAS, rng=rng, image_size=(1024, 768), focal_px=1000.0, arc_deg=50)
-    poses = [pose for pose in wave_board(board, 60, rng=rng, arc_deg=50)]
+    poses = list(wave_board(board, 60, rng=rng, arc_deg=50))
     seen = [min(len(visible_corners(rig, camera, board, pose)[0]) for camera in range(CAMERAS)) for pose in poses]
     poses = [pose for pose, count in zip(poses, seen, strict=True) if count > 40][: POSES + 1]
     turned = rig.T_camera_world.copy()
