@@ -101,6 +101,11 @@ class Rig:
         for name in ("intrinsics", "distortion", "T_camera_world"):
             _require_finite("Rig", name, getattr(self, name))
 
+    @property
+    def centres(self) -> np.ndarray:
+        """(C, 3) float64: where the cameras stand, metres, world."""
+        return -np.einsum("cji,cj->ci", self.T_camera_world[:, :3, :3], self.T_camera_world[:, :3, 3])
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scan:

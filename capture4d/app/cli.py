@@ -19,6 +19,7 @@ from typing import Annotated, Any, Literal, NoReturn
 import tyro
 from tyro.conf import Positional, UseAppendAction, arg
 
+from capture4d.calibration_config import CalibrationConfig, RigCheckConfig
 from capture4d.errors import InputError
 from data_synth import config as synth_config
 from data_synth.scanner_config import ScanConfig
@@ -233,6 +234,92 @@ class ConvertBody:
         return 0
 
 
+@dataclass(frozen=True, kw_only=True)
+class Calibrate:
+    """Calibrate a camera rig from images of a ChArUco board, with a report of how good it is."""
+
+    images: Annotated[Positional[Path], arg(metavar="IMAGES")]
+    """Folder of board images: png, jpg or tif, one a camera and pose of the board."""
+    board: str
+    """charuco:COLUMNSxROWS:SQUARE_MM:MARKER_MM:DICTIONARY, such as charuco:14x10:60:44:DICT_5X5_100."""
+    output: Path
+    """rig.json to write; calibration.json and calibration.html go beside it."""
+    pattern: str = "{camera}/{pose}"
+    """How the images lie in the folder, without their ending."""
+    workers: int = field(default_factory=_all_cores)
+    """Processes to use; the result does not depend on it."""
+    colmap: Path | None = None
+    """Folder for the rig as a COLMAP model as well."""
+    config: Annotated[CalibrationConfig, arg(name="")] = field(default_factory=CalibrationConfig)
+
+    def __call__(self) -> int:
+        from capture4d.app.calibration_page import print_calibration, write_page
+        from capture4d.calibration_stage import run
+
+        report = run(
+            self.images,
+            self.output,
+            self.board,
+            self.config,
+            pattern=self.pattern,
+            colmap=self.colmap,
+            workers=self.workers,
+        )
+        print_calibration(report)
+        page = write_page(self.output.with_name("calibration.html"), report)
+        print(f"rig: {self.output}, report: {page}")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckRig:
+    """Tell which cameras have moved since calibration, from one pose of the board; exits with 1 if one has."""
+
+    rig: Annotated[Positional[Path], arg(metavar="RIG")]
+    """rig.json; the calibration.json beside it knows the board and how certain the rig is."""
+    images: Annotated[Positional[Path], arg(metavar="IMAGES")]
+    """Folder of board images: png, jpg or tif; one pose will do."""
+    board: str | None = None
+    """The board, if it is not the one of the calibration."""
+    pattern: str = "{camera}/{pose}"
+    """How the images lie in the folder, without their ending."""
+    workers: int = field(default_factory=_all_cores)
+    """Processes to use; the result does not depend on it."""
+    config: Annotated[RigCheckConfig, arg(name="")] = field(default_factory=RigCheckConfig)
+
+    def __call__(self) -> int:
+        from capture4d.app.calibration_page import print_check
+        from capture4d.calibration_stage import run_check
+
+        checks = run_check(
+            self.rig, self.images, self.config, board=self.board, pattern=self.pattern, workers=self.workers
+        )
+        print_check(checks)
+        moved = [check.name for check in checks if check.verdict == "moved"]
+        if moved:
+            print(f"capture4d: moved since calibration: {', '.join(moved)}", file=sys.stderr)
+        return 1 if moved else 0
+
+
+@dataclass(frozen=True)
+class ConvertRig:
+    """Convert a rig.json to a COLMAP model, or a COLMAP model to a rig.json."""
+
+    source: Annotated[Positional[Path], arg(metavar="SOURCE")]
+    """rig.json, or a folder with a COLMAP model, binary or text."""
+    output: Path
+    """Folder for the model, or rig.json."""
+    text: bool = False
+    """Write the model as text."""
+
+    def __call__(self) -> int:
+        from capture4d.calibration_stage import convert
+
+        convert(self.source, self.output, text=self.text)
+        print(f"rig: {self.output}")
+        return 0
+
+
 _COMMANDS: Mapping[str, Any] = {
     "demo": Demo,
     "synth": Synth,
@@ -242,7 +329,10 @@ _COMMANDS: Mapping[str, Any] = {
     "run": Run,
     "report": Report,
     "register-mesh": RegisterMesh,
+    "calibrate": Calibrate,
+    "check-rig": CheckRig,
     "convert-body": ConvertBody,
+    "convert-rig": ConvertRig,
 }
 
 _PRESETS: Mapping[Any, Mapping[str, Any]] = {
