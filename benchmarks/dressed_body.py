@@ -1,7 +1,7 @@
 """A body in a loose shell of cloth, and points of it as a scan would have them: quick data for tracking.
 
-The shell is the body's own trunk and upper arms pushed outwards, 3 mm on the shoulders and up to 4 cm at the waist, with
-slow waves that travel over it. It hides what it covers. Nothing of this is simulated: real cloth comes from
+The shell is the body's own trunk and upper arms pushed outwards, 3 mm on the shoulders and up to 4 cm at the waist,
+with slow waves that travel over it. It hides what it covers. Nothing of this is simulated: real cloth comes from
 `data_synth`.
 """
 
@@ -45,8 +45,13 @@ def dress_body(posed: PosedBody, phase: float) -> DressedBody:
     return DressedBody(_part(vertices, faces[~on_garment]), _part(shell, faces[on_garment]))
 
 
-_WAVES = [(np.array(axis), rate) for axis, rate in (
-    ((23.0, 9.0, 4.0), 1.3), ((-11.0, 17.0, 21.0), 0.9), ((5.0, -29.0, 13.0), 2.1), ((31.0, 3.0, -19.0), 1.7))]  # fmt: skip
+_WAVES = (
+    (np.array((23.0, 9.0, 4.0)), 1.3),
+    (np.array((-11.0, 17.0, 21.0)), 0.9),
+    (np.array((5.0, -29.0, 13.0)), 2.1),
+    (np.array((31.0, 3.0, -19.0)), 1.7),
+)
+"""Direction and frequency of each wave in space, radians a metre, and how fast it travels."""
 
 
 def _cover(body: Body) -> tuple[np.ndarray, np.ndarray]:

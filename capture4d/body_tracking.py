@@ -13,13 +13,14 @@ References: cloth term as in Zhang et al., Detailed, Accurate, Human Shape Estim
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.linalg import cho_factor, cho_solve
 
 from capture4d.body_prior import JointPrior, limit_terms, pull_terms
+from capture4d.body_tracking_config import FitConfig, Schedule
 from capture4d.body_tracking_jacobian import (
     BodyState,
     Matches,
@@ -29,7 +30,7 @@ from capture4d.body_tracking_jacobian import (
     pose_surface,
 )
 
-__all__ = ["Expectation", "Fit", "FitConfig", "ScanPoints", "Schedule", "fit_body", "subsample"]
+__all__ = ["Expectation", "Fit", "ScanPoints", "fit_body", "subsample"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,40 +43,6 @@ class ScanPoints:
     """Outwards."""
     cloth: Bool[np.ndarray, " points"]
     """On the garment; the others are on skin or suit."""
-
-
-@dataclass(frozen=True, slots=True)
-class Schedule:
-    """The course of one fit."""
-
-    iterations: int = 4
-    first_scale_m: float = 0.03
-    """Distance at which a point has lost most of its weight, at first, ..."""
-    last_scale_m: float = 0.015
-    """... and in the end."""
-    stop_m: float = 1e-4
-    """The fit is done once no joint centre moves farther in an iteration."""
-
-
-@dataclass(frozen=True, slots=True)
-class FitConfig:
-    """Weights of the terms."""
-
-    point_sigma_m: float = 0.006
-    """Error of one point: noise, and what the body model cannot follow. Neighbouring points err alike, so it is larger
-    than the noise."""
-    cloth_gap_m: float = 0.003
-    """Distance that cloth keeps from skin where it touches."""
-    cloth_pull: float = 0.02
-    """Weight of cloth points outside the body, against 1 inside: where cloth nearly touches it shows the body."""
-    cloth_pull_reach_m: float = 0.008
-    """Distance at which that weight is gone."""
-    normal_cosine: float = 0.3
-    """Points whose normal differs more from the body's are left out."""
-    limit_softness_deg: float = 4.0
-    """Overshoot of a joint limit that weighs as much as one standard deviation."""
-    shape_spread: float = 1.0
-    """Standard deviation of the shape coefficients before any scan."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

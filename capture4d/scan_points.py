@@ -6,27 +6,16 @@ which says less about the body. What has the garment's colour or a border's pain
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from capture4d.body_tracking import ScanPoints
+from capture4d.body_tracking_config import SamplingConfig
 from capture4d.errors import InputError
 from capture4d.garment_extraction import Colour, classify_colours, settle_labels
 from capture4d.mesh_kernels import open_vertices, vertex_normals_kernel
 from capture4d.types import Scan
 
-__all__ = ["SamplingConfig", "scan_points"]
-
-
-@dataclass(frozen=True, slots=True)
-class SamplingConfig:
-    """How many points a scan gives."""
-
-    body_cell_m: float = 0.016
-    """One point per cell of this size on skin and suit."""
-    cloth_cell_m: float = 0.028
-    """The same on the garment."""
+__all__ = ["scan_points"]
 
 
 def scan_points(
@@ -50,7 +39,10 @@ def scan_points(
     order = np.random.default_rng(0).permutation(np.flatnonzero(usable))
     cloth = labels[order] > 0
     kept = np.concatenate(
-        [_one_a_cell(vertices, order[~cloth], config.body_cell_m), _one_a_cell(vertices, order[cloth], config.cloth_cell_m)]
+        [
+            _one_a_cell(vertices, order[~cloth], config.body_cell_m),
+            _one_a_cell(vertices, order[cloth], config.cloth_cell_m),
+        ]
     )
     kept = np.random.default_rng(1).permutation(kept)
     return ScanPoints(vertices[kept], normals[kept], labels[kept] > 0)
