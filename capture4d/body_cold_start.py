@@ -40,6 +40,11 @@ ARM_DIRECTIONS = (
 ELBOW_BENDS_DEG = (15.0, 60.0, 105.0)
 ARMS_TOGETHER = ((0, 0), (1, 0), (2, 0), (3, 0), (4, 0))
 """Arm poses (direction, bend) that the search for the facing tries on both arms at once."""
+COARSE_SAMPLES = 2500
+"""Surface samples of the body while the search is on."""
+LIMB_SPREAD = 0.5
+"""Joints of a smaller spread, radians, are no limbs' and stay nearly at rest while the search is on: a head that turns
+freely before the trunk is in place ends up facing backwards."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,13 +67,14 @@ def find_pose(
     Returns:
         The best fit, and its mean misfit in metres (see `misfit`).
     """
-    coarse = tracked_body(model.body, samples=2500)
+    coarse = tracked_body(model.body, samples=COARSE_SAMPLES)
+    stiff = replace(prior, spread=np.where(prior.spread < LIMB_SPREAD, prior.spread / 4, prior.spread))
     few = subsample(scan, config.points)
     tree = KDTree(scan.points)
     arms = _arms(model.body, prior)
 
     def settle(starts: Iterable[BodyState], schedule: Schedule) -> list[tuple[float, BodyState]]:
-        fits = [fit_body(coarse, prior, few, start, schedule=schedule, config=fit).state for start in starts]
+        fits = [fit_body(coarse, stiff, few, start, schedule=schedule, config=fit).state for start in starts]
         return sorted(((misfit(coarse, few, tree, state), state) for state in fits), key=lambda each: each[0])
 
     found = settle(_upright_starts(model, scan, arms, config.facings), config.rough)[: config.survivors]
@@ -122,9 +128,7 @@ def _upright_starts(model: TrackedBody, scan: ScanPoints, arms: list[_Arm], faci
         for facing in range(facings):
             rotations = state.rotations.copy()
             rotations[0] = Rotation.from_euler("y", 360 * facing / facings, degrees=True).as_matrix()
-            starts.append(
-                replace(state, rotations=rotations, translation=np.array([middle[0] - root[0], 0, middle[2] - root[2]]))
-            )
+            starts.append(replace(state, rotations=rotations, translation=(middle - root) * (1.0, 0.0, 1.0)))
     return starts
 
 

@@ -1,8 +1,8 @@
 """What is known about a pose before any scan: which joints turn at all, how far, and that they do not jump.
 
 Everything is a Gaussian on rotation vectors: log(R_j T_j^-1) about a target T_j (the rest pose, or where the motion
-leads), and one-sided beyond a joint's limits. Moving R_j to exp(w) R_j moves the rotation vector e by J_l^-1(e) w, which
-keeps the normal equations exact far from the target.
+leads), and one-sided beyond a joint's limits. Moving R_j to exp(w) R_j moves the rotation vector e by J_l^-1(e) w,
+which keeps the normal equations exact far from the target.
 
 References: left Jacobian of SO(3) as in Barfoot, State Estimation for Robotics, eq. 7.77.
 """

@@ -5,8 +5,8 @@ The first pass goes forwards. Each frame starts where the last motion leads, and
 frame that fits badly is tried again from farther away, then searched for afresh; one that still fits badly is flagged,
 keeps the pose of the last good one, and the take goes on.
 
-The second pass knows the shape, and both neighbours of a frame: it needs no order. Lost frames start between the nearest
-good ones.
+The second pass knows the shape, and both neighbours of a frame: it needs no order. Lost frames start between the
+nearest good ones.
 """
 
 from __future__ import annotations

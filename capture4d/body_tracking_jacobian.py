@@ -273,7 +273,7 @@ def _interpolate(vertices, normals, faces, face_of, barycentric):
 
 @njit(cache=True)
 def _closest_on_faces(points, candidates, vertices, faces):
-    """The nearest of the candidate faces of each point, and where in it (Ericson, Real-Time Collision Detection, 5.1.5)."""
+    """The nearest of the candidate faces of each point, and where in it."""
     face = np.empty(len(points), np.int32)
     barycentric = np.zeros((len(points), 3))
     here = np.zeros(3)
@@ -300,6 +300,7 @@ def _dot(a, b):
 
 @njit(cache=True)
 def _closest_in_triangle(p, a, b, c, out):
+    """Barycentric coordinates of the nearest point (Ericson, Real-Time Collision Detection, 5.1.5)."""
     ab, ac, ap = b - a, c - a, p - a
     d1, d2 = _dot(ab, ap), _dot(ac, ap)
     if d1 <= 0.0 and d2 <= 0.0:

@@ -1,7 +1,7 @@
 """Motion from elsewhere and back: this project's npz, AMASS npz, and BVH, each told by what is in the file.
 
 own npz    poses.npz as in a capture; as it is
-AMASS npz  `poses` (T, 3 J) axis-angle of SMPL's joints, `trans`, `betas`, frame rate under either of its two names, Z up
+AMASS npz  `poses` (T, 3 J) axis-angle of SMPL's joints, `trans`, `betas`, frame rate under either name, Z up
 BVH        a file with this body's joints is read as it is, with the shape that its bone lengths show; other skeletons
            are retargeted (see `motion_retarget`). Written in centimetres
 
@@ -93,17 +93,15 @@ def _from_npz(path: Path, body: Body) -> PoseSequence:
         if arrays.get("poses") is None:
             poses = load_poses(path)
             if poses.joint_names != body.joint_names:
-                raise InputError(
-                    f"{path}: expected the body's {len(body.joint_names)} joints, found others ({len(poses.joint_names)})"
-                )
+                expected, found = len(body.joint_names), len(poses.joint_names)
+                raise InputError(f"{path}: expected the body's {expected} joints, found {found} others")
             return poses
         vectors, trans = arrays["poses"].astype(np.float64), arrays["trans"].astype(np.float64)
         rates = [found for name in FRAME_RATES if (found := arrays.get(name)) is not None]
         betas = arrays.get("betas")
     if vectors.ndim != 2 or vectors.shape[1] % 3 or vectors.shape[1] < 66 or trans.shape != (len(vectors), 3):
-        raise InputError(
-            f"{path}: expected poses (T, 66 or more) and trans (T, 3), found {vectors.shape}, {trans.shape}"
-        )
+        found = f"{vectors.shape}, {trans.shape}"
+        raise InputError(f"{path}: expected poses (T, 66 or more) and trans (T, 3), found {found}")
     if not rates:
         raise InputError(f"{path}: expected a frame rate as {' or '.join(FRAME_RATES)}, found none")
     count = len(vectors)
