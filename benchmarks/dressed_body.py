@@ -17,7 +17,7 @@ from capture4d.body_tracking import ScanPoints
 from capture4d.mesh import face_areas, face_normals, vertex_normals
 from capture4d.types import Body, Mesh
 
-__all__ = ["DressedBody", "dress_body", "sample_scan"]
+__all__ = ["DressedBody", "covered_vertices", "dress_body", "sample_scan"]
 
 COVERED = ("root", "pelvis", "spine", "clavicle", "shoulder01", "upperarm01")
 
@@ -52,6 +52,11 @@ _WAVES = (
     (np.array((31.0, 3.0, -19.0)), 1.7),
 )
 """Direction and frequency of each wave in space, radians a metre, and how fast it travels."""
+
+
+def covered_vertices(body: Body) -> np.ndarray:
+    """Vertices under the shell, (V,) bool."""
+    return _cover(body)[0]
 
 
 def _cover(body: Body) -> tuple[np.ndarray, np.ndarray]:

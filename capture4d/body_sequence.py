@@ -114,13 +114,17 @@ class Tracker:
         information = last.shape_information if quality.reasons else self._shape_information(fit)
         return Followed(fit.state, information, quality, name, 0, doubtful)
 
-    def refine(self, scan: ScanPoints, start: BodyState, around: Sequence[BodyState], *, lost: bool) -> Refined:
+    def refine(
+        self, scan: ScanPoints, start: BodyState, around: Sequence[BodyState], *, interval_s: float, lost: bool
+    ) -> Refined:
         """A frame with the shape of `start` kept, drawn towards the mean of the frames `around` it, two or none."""
         sequence = self.config.sequence
         expectation = Expectation()
         if len(around) == 2:
             mean = between(around[0], around[1], 0.5)
-            expectation = Expectation(mean.rotations, np.full(len(self.prior.spread), sequence.smooth_spread))
+            expectation = Expectation(
+                mean.rotations, np.full(len(self.prior.spread), sequence.acceleration * interval_s**2)
+            )
         schedule = sequence.retry if lost else sequence.refine
         fit = fit_body(
             self.model,

@@ -234,7 +234,7 @@ def _refine_frame(job: _RefineJob) -> None:
     first, start, around = _surroundings(capture, stage, job.frame_id)
     start = replace(start, shape=np.array(job.shape))
     points = _points(capture, job.frame_id, job.config)
-    refined = tracker.refine(points, start, around, lost=first.quality.lost)
+    refined = tracker.refine(points, start, around, interval_s=1 / capture.fps, lost=first.quality.lost)
     _save_refined(stage, job.frame_id, first, refined, time.process_time() - begin)
 
 

@@ -86,8 +86,9 @@ class SequenceConfig:
     """Share of the last motion that is expected to go on."""
     motion_spread: float = 0.2
     """Standard deviation of a joint's turn from what is expected, radians a frame."""
-    smooth_spread: float = 0.1
-    """The same from the mean of the frames before and after, in the second pass."""
+    acceleration: float = 15.0
+    """How fast the turning of a joint changes, radians a second squared: the second pass draws a frame so much towards
+    the mean of its neighbours."""
     shape_memory: float = 0.99
     """Share of what is known about the shape that is kept from frame to frame."""
     search_every: int = 15

@@ -22,7 +22,7 @@ from capture4d.motion_retarget import pose_sequence, retarget
 from capture4d.types import PoseSequence
 from data_synth.config import ClipName, MotionConfig
 
-__all__ = ["make_motion", "sample_poses", "scripted_clip"]
+__all__ = ["make_motion", "random_pose", "sample_poses", "scripted_clip"]
 
 Keyframe = tuple[float, dict[str, float]]
 """Time in seconds, and controls in degrees; a control that is not named keeps its last value, 0 at the start."""
@@ -188,9 +188,7 @@ def sample_poses(shaped: ShapedBody, fps: float, frames: int, rng: np.random.Gen
     count = int(np.ceil(frames / interval)) + 1
     anchors = [np.repeat(np.eye(3)[None], len(shaped.body.joint_names), axis=0)]
     while len(anchors) < count:
-        candidate = _sample_pose(shaped, rng)
-        if not arms_enter_trunk(shaped, candidate):
-            anchors.append(candidate)
+        anchors.append(random_pose(shaped, rng))
     phase = np.arange(frames) / interval
     phase = np.floor(phase) + (lambda x: x * x * (3 - 2 * x))(phase - np.floor(phase))
     stacked = np.stack(anchors)
@@ -202,6 +200,14 @@ def sample_poses(shaped: ShapedBody, fps: float, frames: int, rng: np.random.Gen
         axis=1,
     )
     return pose_sequence(shaped, rotations, fps)
+
+
+def random_pose(shaped: ShapedBody, rng: np.random.Generator) -> np.ndarray:
+    """One pose, (J, 3, 3), as `sample_poses` draws them: the arms stay out of the trunk."""
+    while True:
+        candidate = _sample_pose(shaped, rng)
+        if not arms_enter_trunk(shaped, candidate):
+            return candidate
 
 
 def _sample_pose(shaped: ShapedBody, rng: np.random.Generator) -> np.ndarray:
