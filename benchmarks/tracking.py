@@ -48,7 +48,8 @@ from capture4d.workdir import read_json
 
 MOCAP = Path(__file__).resolve().parents[2] / "shared" / "data" / "mocap" / "cmu_131_03_start_hop_stop.bvh"
 JOINTS = (
-    "root", "spine", "neck", "head", "clavicle", "upperarm01", "lowerarm01", "wrist", "upperleg01", "lowerleg01", "foot",
+    "root", "spine", "neck", "head", "clavicle", "upperarm01", "lowerarm01", "wrist", "upperleg01", "lowerleg01",
+    "foot",
 )  # fmt: skip
 SHAPES = ((1.2, -0.8, 0.7, 0.5, -0.6, 0.4), (-1.0, 1.1, -0.5, 0.6, 0.3, -0.4))
 RIGHT_MM = 30.0
@@ -64,6 +65,7 @@ def run(
     scanned: int = 12,
     cloth: bool = True,
     capture: Path | None = None,
+    mocap: Path = MOCAP,
     seed: int = 0,
 ) -> list[Metric]:
     """Track takes of known motion, and find poses from nowhere.
@@ -75,13 +77,16 @@ def run(
         scanned: frames that go through the virtual cameras.
         cloth: track and register a simulated T-shirt as well.
         capture: capture folder with truth to do that on, instead of the cached `demo` take.
+        mocap: BVH file of the second take; a scripted clip where there is none.
         seed: of noise, holes and random poses.
     """
     if quick:
         frames, cold_starts, scanned = 15, 4, 3
     body, console = load_anny(), Console(stderr=True)
     tracker = Tracker.create(body, TrackingConfig())
-    takes = [_track_take(tracker, poses, np.random.default_rng([seed, k])) for k, poses in _motions(body, frames)]
+    takes = [
+        _track_take(tracker, poses, np.random.default_rng([seed, k])) for k, poses in _motions(body, frames, mocap)
+    ]
     joint_mm = np.concatenate([take.joint_mm for take in takes])
     metrics = [
         Metric("joint_mean_mm", float(joint_mm.mean()), "mm"),
@@ -94,20 +99,20 @@ def run(
     console.print("\n".join(f"{metric.key} {metric.value:.3f}" for metric in metrics))
     metrics += _cold_starts(tracker, cold_starts, np.random.default_rng([seed, 10]), console)
     with tempfile.TemporaryDirectory(prefix="capture4d-tracking-") as scratch:
-        metrics += _scanner(body, scanned, Path(scratch), seed)
+        metrics += _scanner(body, scanned, Path(scratch), mocap, seed)
         if cloth:
             metrics += _cloth(capture or _simulated(quick), Path(scratch))
     return metrics
 
 
-def _motions(body: Body, frames: int) -> Iterator[tuple[int, PoseSequence]]:
+def _motions(body: Body, frames: int, mocap: Path) -> Iterator[tuple[int, PoseSequence]]:
     from data_synth.motions import CLIPS, scripted_clip
 
     people = [with_shape(body, np.array(shape, np.float32)) for shape in SHAPES]
     rng = np.random.default_rng(0)
     yield 0, scripted_clip(people[0], CLIPS["range-of-motion"], 60.0, frames, rng)
-    if MOCAP.is_file():
-        yield 1, _cut(retarget(people[1], read_bvh(MOCAP), 60.0, first_frame=120), frames)
+    if mocap.is_file():
+        yield 1, _cut(retarget(people[1], read_bvh(mocap), 60.0, first_frame=120), frames)
     else:
         yield 1, scripted_clip(people[1], CLIPS["reach"], 60.0, frames, rng)
 
@@ -225,14 +230,14 @@ def _random_person(body: Body, rng: np.random.Generator) -> PosedBody:
 # --- through the cameras -----------------------------------------------------------------------------------------
 
 
-def _scanner(body: Body, frames: int, scratch: Path, seed: int) -> list[Metric]:
+def _scanner(body: Body, frames: int, scratch: Path, mocap: Path, seed: int) -> list[Metric]:
     """A capture of the shell, seen by cameras all round and tracked from its files."""
     from data_synth.rig import capture_rig
     from data_synth.scanner import LABEL_BODY, LABEL_GARMENT, Surface, scan_surfaces
     from data_synth.scanner_config import ScannerConfig
 
     person = with_shape(body, np.array(SHAPES[1], np.float32))
-    _, truth = list(_motions(body, 4 * frames))[1]
+    _, truth = list(_motions(body, 4 * frames, mocap))[1]
     rig = capture_rig(centre=(0.0, 0.95, 0.0), radius=1.1, cameras=24)
     config = ScannerConfig()
     capture = Capture(scratch / "scanned", "shell", truth.fps / 4, tuple(range(1, frames + 1)), CLOTH, {})
@@ -320,9 +325,8 @@ def _cloth(folder: Path, scratch: Path) -> list[Metric]:
     ]
     for key in ("truth_distance_mean_mm", "border_mean_mm", "correspondence_mean_mm"):
         metrics.append(Metric(f"tracked_{key}", scores["tracked"][key], "mm"))
-        metrics.append(
-            Metric(f"tracked_to_true_{key.removesuffix('_mm')}", scores["tracked"][key] / scores["true"][key])
-        )
+        ratio = scores["tracked"][key] / scores["true"][key]
+        metrics.append(Metric(f"tracked_to_true_{key.removesuffix('_mm')}", ratio))
     return metrics
 
 

@@ -40,6 +40,9 @@ ARM_DIRECTIONS = (
 ELBOW_BENDS_DEG = (15.0, 60.0, 105.0)
 ARMS_TOGETHER = ((0, 0), (1, 0), (2, 0), (3, 0), (4, 0))
 """Arm poses (direction, bend) that the search for the facing tries on both arms at once."""
+SHAPE_COST_M = 0.0015
+"""Misfit that one standard deviation of one shape coefficient is worth."""
+DISTINCT_RAD = 0.35
 COARSE_SAMPLES = 2500
 """Surface samples of the body while the search is on."""
 LIMB_SPREAD = 0.5
@@ -77,13 +80,14 @@ def find_pose(
         fits = [fit_body(coarse, stiff, few, start, schedule=schedule, config=fit).state for start in starts]
         return sorted(((misfit(coarse, few, tree, state), state) for state in fits), key=lambda each: each[0])
 
-    found = settle(_upright_starts(model, scan, arms, config.facings), config.rough)[: config.survivors]
+    found = _distinct(settle(_upright_starts(model, scan, arms, config.facings), config.rough), config.survivors)
     for arm in arms:
         starts = [_with_arm(state, arm, direction, bend) for _, state in found for direction, bend in _arm_poses()]
         kept = max(config.survivors - 2, config.finalists)
         found = _distinct(sorted(found + settle(starts, config.arms), key=lambda each: each[0]), kept)
     fits = [
-        fit_body(model, prior, scan, state, schedule=config.full, config=fit) for _, state in found[: config.finalists]
+        fit_body(model, prior, scan, state, schedule=config.full, config=fit)
+        for _, state in _distinct(found, config.finalists)
     ]
     scored = [(misfit(model, scan, tree, each.state), each) for each in fits]
     best = min(range(len(scored)), key=lambda index: scored[index][0])
@@ -96,7 +100,8 @@ def misfit(
     """Root mean square distance between scan and body, metres; distances beyond `far_m` count as that.
 
     Cloth may hang `slack_m` outside of the body at no cost, and body parts need not be scanned where they are hidden,
-    so the way from body to scan counts a third.
+    so the way from body to scan counts a third. An unlikely shape counts as a misfit: the back of one person can be
+    made to look like the front of a stranger one.
     """
     surface = pose_surface(model, state)
     matches = match(surface, scan.points, scan.normals, faces=1)
@@ -112,7 +117,8 @@ def misfit(
     inside = ((samples > low - far_m) & (samples < high + far_m)).all(axis=1)
     back = np.minimum(tree.query(samples[inside])[0], far_m)
     back = np.maximum(back - 0.03, 0)
-    return float(np.sqrt((there**2).mean() + (back**2).sum() / max(len(samples), 1) / 3))
+    unlikely = SHAPE_COST_M**2 * (state.shape**2).sum()
+    return float(np.sqrt((there**2).mean() + (back**2).sum() / max(len(samples), 1) / 3 + unlikely))
 
 
 def _upright_starts(model: TrackedBody, scan: ScanPoints, arms: list[_Arm], facings: int) -> list[BodyState]:
@@ -162,14 +168,21 @@ def _arms(body: Body, prior: JointPrior) -> list[_Arm]:
 
 
 def _distinct(ranked: list[tuple[float, BodyState]], count: int) -> list[tuple[float, BodyState]]:
-    """The best few that differ from each other by more than an iteration would settle."""
+    """The best few that differ from each other by more than an iteration would settle.
+
+    A third of the places is for bodies that face away from the best one: front and back look much alike from afar.
+    """
     kept: list[tuple[float, BodyState]] = []
+    away = 0
     for score, state in ranked:
-        turns = [
-            Rotation.from_matrix(state.rotations @ other.rotations.swapaxes(1, 2)).magnitude() for _, other in kept
-        ]
-        if all(turn.max() > 0.35 for turn in turns):
-            kept.append((score, state))
+        turns = [state.rotations @ other.rotations.swapaxes(1, 2) for _, other in kept]
+        if not all(Rotation.from_matrix(turn).magnitude().max() > DISTINCT_RAD for turn in turns):
+            continue
+        opposed = bool(kept) and float(state.rotations[0, :, 2] @ kept[0][1].rotations[0, :, 2]) < 0
+        if not opposed and len(kept) - away >= count - max(count // 3, 1):
+            continue
+        kept.append((score, state))
+        away += opposed
         if len(kept) == count:
             break
     return kept

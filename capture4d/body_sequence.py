@@ -173,7 +173,12 @@ class Tracker:
         )
 
     def _judge(self, scan: ScanPoints, fit: Fit) -> Quality:
-        return judge(fit.distances, scan.cloth, self.config.sequence)
+        quality = judge(fit.distances, scan.cloth, self.config.sequence)
+        largest = float(np.abs(fit.state.shape).max(initial=0.0))
+        if largest <= self.config.sequence.largest_shape:
+            return quality
+        reason = f"a shape coefficient of {largest:.1f} standard deviations"
+        return replace(quality, reasons=(*quality.reasons, reason))
 
     def _look(self, scan: ScanPoints, state: BodyState) -> tuple[Quality, np.ndarray]:
         """Quality of a state, and the joints it was seen by."""

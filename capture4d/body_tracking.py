@@ -102,7 +102,8 @@ def fit_body(
         fixed_shape: keep the start's shape.
     """
     expectation = expectation or Expectation()
-    state, size = start, 3 + 3 * len(start.rotations) + (0 if fixed_shape else len(start.shape))
+    state, pose = start, 3 + 3 * len(start.rotations)
+    size = pose if fixed_shape else pose + len(start.shape)
     information, distances, done = np.zeros((size, size)), np.zeros(0), 0
     ratio = schedule.last_scale_m / schedule.first_scale_m
     for step in range(schedule.iterations):
@@ -117,7 +118,9 @@ def fit_body(
         information, descent = _prior_terms(state, prior, expectation, config, size)
         information += rows.T @ weighted
         descent += weighted.T @ residual[active]
-        change = cho_solve(cho_factor(information), descent)
+        damping = np.full(size, 1 / config.shape_step**2)
+        damping[:pose] = 1 / config.turn_step**2
+        change = cho_solve(cho_factor(information + np.diag(damping)), descent)
         moved = state.moved(change)
         if _largest_motion(model, change) < schedule.stop_m:
             state = moved
@@ -138,7 +141,8 @@ def _weigh(
     reach = config.cloth_pull_reach_m
     pull = config.cloth_pull * (reach**2 / (reach**2 + residual**2)) ** 2
     robust = np.where(scan.cloth & (residual > 0), pull, robust)
-    weight = np.where(agree, robust, 0.0) / config.point_sigma_m**2
+    uncertain = config.point_sigma_m**2 + (config.mismatch * scale) ** 2
+    weight = np.where(agree, robust, 0.0) / uncertain
     return residual, weight, np.where(agree, along, np.nan)
 
 

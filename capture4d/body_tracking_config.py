@@ -35,10 +35,16 @@ class Schedule:
 class FitConfig:
     """Weights of the terms. Figures from `python -m benchmarks tracking`, on other settings of the same takes."""
 
-    point_sigma_m: float = 0.006
+    point_sigma_m: float = 0.008
     """Error of one point: noise, and what the body model cannot follow. Neighbouring points err alike, so it is larger
     than the noise."""
-    cloth_gap_m: float = 0.003
+    mismatch: float = 0.25
+    """Error of a match, as a share of the distance at which points lose their weight: wide searches trust them less."""
+    turn_step: float = 0.3
+    """Levenberg damping: the turn, radians (or metres), of one step that costs as much as one standard deviation."""
+    shape_step: float = 1.0
+    """The same for shape coefficients."""
+    cloth_gap_m: float = 0.004
     """Distance that cloth keeps from skin where it touches."""
     cloth_pull: float = 0.02
     """Weight of cloth points outside the body, against 1 inside: where cloth nearly touches it shows the body."""
@@ -86,7 +92,7 @@ class SequenceConfig:
     """Share of the last motion that is expected to go on."""
     motion_spread: float = 0.2
     """Standard deviation of a joint's turn from what is expected, radians a frame."""
-    acceleration: float = 15.0
+    acceleration: float = 10.0
     """How fast the turning of a joint changes, radians a second squared: the second pass draws a frame so much towards
     the mean of its neighbours."""
     shape_memory: float = 0.99
@@ -99,6 +105,8 @@ class SequenceConfig:
     """Frames with a smaller share of explained points are flagged."""
     fail_explained: float = 0.6
     """Frames with a smaller share are lost: nothing is built upon them."""
+    largest_shape: float = 3.5
+    """Frames that need a shape coefficient beyond this are flagged: the pose is wrong, or the body."""
     least_points: int = 150
     """Frames with fewer points on skin and suit are lost as well."""
 

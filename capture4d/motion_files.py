@@ -222,6 +222,6 @@ def _shape_of_bones(body: Body, offsets: np.ndarray) -> np.ndarray:
     mean = (body.joints[1:] - body.joints[parents]).astype(np.float64)
     directions = (body.joint_directions[:, 1:] - body.joint_directions[:, parents]).astype(np.float64)
     columns = directions.reshape(len(directions), -1).T
-    ridge = 1e-6 * np.eye(columns.shape[1])
+    ridge = 1e-9 * np.eye(columns.shape[1])
     error = (offsets[1:] - mean).ravel()
     return np.linalg.solve(columns.T @ columns + ridge, columns.T @ error).astype(np.float32)
