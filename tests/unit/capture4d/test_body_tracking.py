@@ -214,11 +214,11 @@ def test_a_take_goes_on_after_bad_frames() -> None:
 
 
 @pytest.mark.slow
-def test_a_pose_is_found_from_nowhere(seed: int = 0) -> None:
+def test_a_pose_is_found_from_nowhere() -> None:
     from data_synth.motions import random_pose
 
     body = load_anny()
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     person = with_shape(body, rng.normal(0, 0.7, 4).astype(np.float32))
     rotations = random_pose(person, rng)
     rotations[0] = Rotation.from_euler("y", rng.uniform(0, 360), degrees=True).as_matrix()
