@@ -16,12 +16,13 @@ from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation, Slerp
 
 from capture4d.body import ShapedBody, with_pose
+from capture4d.bvh_format import read_bvh
 from capture4d.errors import InputError
+from capture4d.motion_retarget import pose_sequence, retarget
 from capture4d.types import PoseSequence
-from data_synth.bvh import read_bvh, retarget
 from data_synth.config import ClipName, MotionConfig
 
-__all__ = ["make_motion", "pose_sequence", "sample_poses", "scripted_clip"]
+__all__ = ["make_motion", "random_pose", "sample_poses", "scripted_clip"]
 
 Keyframe = tuple[float, dict[str, float]]
 """Time in seconds, and controls in degrees; a control that is not named keeps its last value, 0 at the start."""
@@ -87,30 +88,6 @@ def make_motion(
     else:
         raise InputError(f"clip: expected one of {', '.join(get_args(ClipName))}, found {config.clip!r}")
     return _cut(poses, config.skip_frames, frames)
-
-
-def pose_sequence(
-    shaped: ShapedBody, rotations: np.ndarray, fps: float, translations: np.ndarray | None = None
-) -> PoseSequence:
-    """Stand a motion on the floor: one vertical shift for the whole clip puts its lowest point at y = 0.
-
-    Args:
-        rotations: (T, J, 3, 3).
-        translations: (T, 3) of the root, metres; zero if None.
-    """
-    count = len(rotations)
-    translations = np.zeros((count, 3)) if translations is None else translations.copy()
-    probes = np.linspace(0, count - 1, min(count, 24)).round().astype(int)
-    lowest = min(with_pose(shaped, rotations[t], translations[t]).vertices()[:, 1].min() for t in probes)
-    translations[:, 1] -= lowest
-    return PoseSequence(
-        rotations.astype(np.float32),
-        translations.astype(np.float32),
-        shaped.shape.astype(np.float32),
-        np.arange(count, dtype=np.int32),
-        fps,
-        shaped.body.joint_names,
-    )
 
 
 def _cut(poses: PoseSequence, start: int, frames: int) -> PoseSequence:
@@ -211,9 +188,7 @@ def sample_poses(shaped: ShapedBody, fps: float, frames: int, rng: np.random.Gen
     count = int(np.ceil(frames / interval)) + 1
     anchors = [np.repeat(np.eye(3)[None], len(shaped.body.joint_names), axis=0)]
     while len(anchors) < count:
-        candidate = _sample_pose(shaped, rng)
-        if not arms_enter_trunk(shaped, candidate):
-            anchors.append(candidate)
+        anchors.append(random_pose(shaped, rng))
     phase = np.arange(frames) / interval
     phase = np.floor(phase) + (lambda x: x * x * (3 - 2 * x))(phase - np.floor(phase))
     stacked = np.stack(anchors)
@@ -225,6 +200,14 @@ def sample_poses(shaped: ShapedBody, fps: float, frames: int, rng: np.random.Gen
         axis=1,
     )
     return pose_sequence(shaped, rotations, fps)
+
+
+def random_pose(shaped: ShapedBody, rng: np.random.Generator) -> np.ndarray:
+    """One pose, (J, 3, 3), as `sample_poses` draws them: the arms stay out of the trunk."""
+    while True:
+        candidate = _sample_pose(shaped, rng)
+        if not arms_enter_trunk(shaped, candidate):
+            return candidate
 
 
 def _sample_pose(shaped: ShapedBody, rng: np.random.Generator) -> np.ndarray:

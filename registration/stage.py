@@ -19,9 +19,10 @@ from pathlib import Path
 
 import numpy as np
 
+from capture4d.body_stage import load_tracking, tracking_digest
 from capture4d.errors import InputError
 from capture4d.garment_stage import load_garment_scan
-from capture4d.scans import load_garment, read_body, read_capture, read_poses, read_template, save_garment
+from capture4d.scans import Capture, load_garment, read_body, read_capture, read_poses, read_template, save_garment
 from capture4d.types import RegisteredSequence
 from capture4d.workdir import (
     Stage,
@@ -50,6 +51,7 @@ class SegmentJob:
 
     capture: Path
     garment_folder: Path
+    body_folder: Path | None
     stage: Stage
     positions: range
 
@@ -60,30 +62,33 @@ def run(
     output: Path,
     config: RegistrationConfig,
     *,
+    body_folder: Path | None = None,
     workers: int = 1,
     overwrite: bool = False,
 ) -> str:
     """Register the template to every frame that has none yet; the digest of the result.
 
+    Args:
+        body_folder: tracked body to move the template with; None takes the poses that the capture brings.
     Raises:
         InputError: the capture or the garments are missing or unfinished, or poses, body and template disagree.
     """
     description = read_capture(capture)
     command = f"capture4d extract {capture} --output {output.parent}"
-    digest = require_complete(garment_folder, "extract", command)
-    stage = open_stage(
-        output, name="register", schema=SCHEMA, config=config, upstream={"garment": digest}, overwrite=overwrite
-    )
+    upstream = {"garment": require_complete(garment_folder, "extract", command)}
+    if body_folder is not None:
+        upstream["body"] = tracking_digest(body_folder, capture)
+    stage = open_stage(output, name="register", schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite)
     garment = read_template(description)
     if description.boundary_colours and not garment.loops:
         raise InputError(f"{capture}: expected a template with open borders, as its scans have; found none")
     if not (output / "garment.npz").is_file():
         save_garment(output / "garment.npz", garment)
-    mover = Mover.create(_analysis(capture, config), read_body(description), read_poses(description))
+    mover = _mover(description, body_folder, _analysis(capture, config))
     frame_ids = description.frame_ids
     pending = set(stage.pending(frame_ids))
     jobs = [
-        SegmentJob(capture, garment_folder, stage, positions)
+        SegmentJob(capture, garment_folder, body_folder, stage, positions)
         for positions in segments(mover, len(frame_ids), config.sequence)
         if pending.intersection(frame_ids[position] for position in positions)
     ]
@@ -107,6 +112,12 @@ def load_registration(folder: Path) -> RegisteredSequence:
     return RegisteredSequence(garment, vertices, np.array(residual, np.float32), np.array(frame_ids, np.int32))
 
 
+def _mover(capture: Capture, body_folder: Path | None, analysis: TemplateAnalysis) -> Mover | None:
+    if body_folder is None:
+        return Mover.create(analysis, read_body(capture), read_poses(capture))
+    return Mover.create(analysis, *load_tracking(body_folder))
+
+
 @lru_cache(maxsize=2)
 def _analysis(capture: Path, config: RegistrationConfig) -> TemplateAnalysis:
     """One analysis per process, template and settings."""
@@ -118,7 +129,7 @@ def _register_job(config: RegistrationConfig, job: SegmentJob) -> int:
     description = read_capture(job.capture)
     frame_ids = description.frame_ids
     analysis = _analysis(job.capture, config)
-    mover = Mover.create(analysis, read_body(description), read_poses(description))
+    mover = _mover(description, job.body_folder, analysis)
     pending = set(job.stage.pending([frame_ids[position] for position in job.positions]))
 
     def done(frame_id: int) -> tuple[np.ndarray, bool] | None:

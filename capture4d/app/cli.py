@@ -19,6 +19,7 @@ from typing import Annotated, Any, Literal, NoReturn
 import tyro
 from tyro.conf import Positional, UseAppendAction, arg
 
+from capture4d.body_tracking_config import TrackingConfig
 from capture4d.calibration_config import CalibrationConfig, RigCheckConfig
 from capture4d.errors import InputError
 from data_synth import config as synth_config
@@ -128,6 +129,24 @@ class Extract(_Stage):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Track(_Stage):
+    """Track the body through every scan: its poses, and one shape for the take."""
+
+    capture: Annotated[Positional[Path], arg(metavar="CAPTURE")]
+    """Capture folder."""
+    output: Path
+    """Work folder; gets body/."""
+    config: Annotated[TrackingConfig, arg(name="")] = field(default_factory=TrackingConfig)
+
+    def __call__(self) -> int:
+        from capture4d.body_stage import run
+
+        run(self.capture, self.output / "body", self.config, workers=self.workers, overwrite=self.overwrite)
+        print(f"body: {self.output / 'body'}")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
 class Register(_Stage):
     """Register the template to every frame whose garment `extract` has cut out."""
 
@@ -135,6 +154,8 @@ class Register(_Stage):
     """Capture folder."""
     output: Path
     """Work folder; holds garment/ and gets registration/."""
+    tracked: bool = False
+    """Move the template with the body that `track` found, not with the poses the capture brings."""
     preset: Literal["default", "paper"] = "default"
     """What the settings below start from; `paper` is DeepWrinkles as printed."""
     config: Annotated[RegistrationConfig, arg(name="")] = field(default_factory=RegistrationConfig)
@@ -147,6 +168,7 @@ class Register(_Stage):
             self.output / "garment",
             self.output / "registration",
             self.config,
+            body_folder=self.output / "body" if self.tracked else None,
             workers=self.workers,
             overwrite=self.overwrite,
         )
@@ -176,7 +198,7 @@ class RegisterMesh:
 
 @dataclass(frozen=True, kw_only=True)
 class Run(_Stage):
-    """Run every stage on a capture: extract, register, report."""
+    """Run every stage on a capture: extract, track if it brings no poses, register, report."""
 
     capture: Annotated[Positional[Path], arg(metavar="CAPTURE")]
     """Capture folder."""
@@ -184,12 +206,23 @@ class Run(_Stage):
     """Work folder."""
     preset: Literal["default", "paper"] = "default"
     """What the settings of the registration start from; `paper` is DeepWrinkles as printed."""
+    track: bool = False
+    """Track the body even if the capture brings poses."""
     config: Annotated[RegistrationConfig, arg(name="registration")] = field(default_factory=RegistrationConfig)
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
 
     def __call__(self) -> int:
         from capture4d.app.pipeline import run_all
 
-        report = run_all(self.capture, self.output, self.config, workers=self.workers, overwrite=self.overwrite)
+        report = run_all(
+            self.capture,
+            self.output,
+            self.config,
+            tracking=self.tracking,
+            track=self.track,
+            workers=self.workers,
+            overwrite=self.overwrite,
+        )
         print(f"report: {report}")
         return 0
 
@@ -320,11 +353,39 @@ class ConvertRig:
         return 0
 
 
+@dataclass(frozen=True)
+class ConvertPoses:
+    """Convert a motion between poses.npz, AMASS npz and BVH, retargeted to a body where the skeletons differ."""
+
+    input: Annotated[Positional[Path], arg(metavar="IN")]
+    """Motion file, .npz or .bvh; what kind of npz is told by its arrays."""
+    output: Annotated[Positional[Path], arg(metavar="OUT")]
+    """Motion file to write, .npz or .bvh."""
+    body: Path | None = None
+    """The body that moves, a body.npz; the built-in one if absent."""
+    format: Literal["poses", "amass"] = "poses"
+    """What kind of .npz to write."""
+    fps: float | None = None
+    """Frame rate of the result; that of the input if absent."""
+
+    def __call__(self) -> int:
+        from capture4d.body_anny import load_anny
+        from capture4d.motion_files import read_motion, write_motion
+        from capture4d.records import load_body
+
+        body = load_body(self.body) if self.body else load_anny()
+        poses = read_motion(self.input, body, fps=self.fps)
+        write_motion(self.output, body, poses, amass=self.format == "amass")
+        print(f"{len(poses.frame_ids)} poses at {poses.fps:g} fps: {self.output}")
+        return 0
+
+
 _COMMANDS: Mapping[str, Any] = {
     "demo": Demo,
     "synth": Synth,
     "scan": Scan,
     "extract": Extract,
+    "track": Track,
     "register": Register,
     "run": Run,
     "report": Report,
@@ -333,6 +394,7 @@ _COMMANDS: Mapping[str, Any] = {
     "check-rig": CheckRig,
     "convert-body": ConvertBody,
     "convert-rig": ConvertRig,
+    "convert-poses": ConvertPoses,
 }
 
 _PRESETS: Mapping[Any, Mapping[str, Any]] = {

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from capture4d.body_tracking_config import TrackingConfig
 from capture4d.errors import InputError
 from capture4d.workdir import read_json
 from registration.config import RegistrationConfig
 
-__all__ = ["broken_limits", "parse_limits", "run_all", "run_demo", "run_report"]
+__all__ = ["broken_limits", "needs_tracking", "parse_limits", "run_all", "run_demo", "run_report"]
 
 
 def run_demo(output: Path, *, workers: int, overwrite: bool = False) -> Path:
@@ -21,14 +22,49 @@ def run_demo(output: Path, *, workers: int, overwrite: bool = False) -> Path:
     return run_all(output / "capture", output, RegistrationConfig(), workers=workers, overwrite=overwrite)
 
 
-def run_all(capture: Path, output: Path, config: RegistrationConfig, *, workers: int, overwrite: bool = False) -> Path:
-    """Extract, register, report; the path of the report. Stages that are complete cost seconds."""
+def run_all(
+    capture: Path,
+    output: Path,
+    config: RegistrationConfig,
+    *,
+    tracking: TrackingConfig | None = None,
+    track: bool = False,
+    workers: int,
+    overwrite: bool = False,
+) -> Path:
+    """Extract, track if need be, register, report; the path of the report. Stages that are complete cost seconds.
+
+    Args:
+        track: track the body even if the capture brings poses.
+    """
     from capture4d.garment_stage import run as extract
     from registration.stage import run as register
 
     extract(capture, output / "garment", workers=workers, overwrite=overwrite)
-    register(capture, output / "garment", output / "registration", config, workers=workers, overwrite=overwrite)
+    body_folder = None
+    if track or needs_tracking(capture):
+        from capture4d.body_stage import run as track_body
+
+        body_folder = output / "body"
+        track_body(capture, body_folder, tracking or TrackingConfig(), workers=workers, overwrite=overwrite)
+    register(
+        capture,
+        output / "garment",
+        output / "registration",
+        config,
+        body_folder=body_folder,
+        workers=workers,
+        overwrite=overwrite,
+    )
     return run_report(output, capture=capture, workers=workers, overwrite=overwrite)
+
+
+def needs_tracking(capture: Path) -> bool:
+    """Whether the template is bound to a body of which the capture has no poses."""
+    from capture4d.scans import read_capture, read_template
+
+    description = read_capture(capture)
+    return not (capture / "poses.npz").is_file() and read_template(description).skin_weights is not None
 
 
 def run_report(work: Path, *, capture: Path | None = None, workers: int = 1, overwrite: bool = False) -> Path:

@@ -1,0 +1,317 @@
+"""The stage that tracks the body: CAPTURE in, WORK/body out.
+
+stage.json               what was run
+body.npz                 the body that was tracked: the capture's, else the built-in one
+frames/000123.npz        first pass, forwards: where the next frame starts from
+refined/000123.npz       second pass: rotations, translation, seen joints
+metrics/000123.json      verdict (good, check, lost), reasons, numbers and CPU time
+poses.npz                the take's poses and shape, as a capture would bring them
+metrics.jsonl            the frames' metrics, one per line
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from capture4d.body_anny import load_anny
+from capture4d.body_sequence import Followed, Quality, Refined, Tracker, between
+from capture4d.body_tracking import ScanPoints
+from capture4d.body_tracking_config import TrackingConfig
+from capture4d.body_tracking_jacobian import BodyState
+from capture4d.errors import InputError
+from capture4d.motion_files import read_motion
+from capture4d.records import ArrayFile, load_body, load_poses, save_body, save_poses
+from capture4d.scan_points import scan_points
+from capture4d.scans import Capture, capture_digest, read_body, read_capture, read_scan, scan_path
+from capture4d.types import Body, PoseSequence
+from capture4d.workdir import (
+    Stage,
+    file_digest,
+    open_stage,
+    read_json,
+    require_complete,
+    run_jobs,
+    write_bytes,
+    write_json,
+    write_npz,
+)
+
+__all__ = ["load_tracking", "run", "tracking_digest"]
+
+SCHEMA = 1
+STARTS = ("search", "rest")
+
+
+def run(capture: Path, output: Path, config: TrackingConfig, *, workers: int = 1, overwrite: bool = False) -> str:
+    """Track the body through every frame; the digest of the result.
+
+    Raises:
+        InputError: the capture is damaged, or the start is no pose of its body.
+    """
+    description = read_capture(capture)
+    upstream = {"capture": capture_digest(description)}
+    if config.start not in STARTS:
+        start_file = Path(config.start)
+        if not start_file.is_file():
+            raise InputError(f"start: expected {', '.join(STARTS)} or a motion file, found '{config.start}'")
+        upstream["start"] = file_digest([start_file], root=start_file.parent)
+    stage = open_stage(
+        output,
+        name="track",
+        schema=SCHEMA,
+        config=config,
+        upstream=upstream,
+        sources={"capture": capture},
+        overwrite=overwrite,
+    )
+    if not (output / "body.npz").is_file():
+        save_body(output / "body.npz", read_body(description) or load_anny())
+    _follow(description, stage, config, workers)
+    shape = _take_shape(stage, description.frame_ids)
+    jobs = [
+        _RefineJob(capture, stage, config, frame_id, shape)
+        for frame_id in stage.pending(description.frame_ids, folder="refined")
+    ]
+    for _ in run_jobs(_refine_frame, jobs, workers=workers, label="refine poses"):
+        pass
+    return _collect(description, stage, shape)
+
+
+def tracking_digest(folder: Path, capture: Path) -> str:
+    """Digest of a finished tracking.
+
+    Raises:
+        InputError: it is missing or unfinished.
+    """
+    return require_complete(folder, "track", f"capture4d track {capture} --output {folder.parent}")
+
+
+def load_tracking(folder: Path) -> tuple[Body, PoseSequence]:
+    """The tracked body and its poses."""
+    return load_body(folder / "body.npz"), load_poses(folder / "poses.npz")
+
+
+# --- first pass --------------------------------------------------------------------------------------------------
+
+
+def _follow(capture: Capture, stage: Stage, config: TrackingConfig, workers: int) -> None:
+    """One frame after the other, from where an earlier run stopped."""
+    frame_ids = capture.frame_ids
+    if not stage.pending(frame_ids):
+        return
+    job = _FollowJob(capture.path, stage, config)
+    for _ in run_jobs(
+        _follow_frames, [job], workers=min(workers, 1), label="track body", units=lambda _: len(frame_ids),
+        finished=lambda: len(frame_ids) - len(stage.pending(frame_ids)),
+    ):  # fmt: skip
+        pass
+
+
+@dataclass(frozen=True, slots=True)
+class _FollowJob:
+    capture: Path
+    stage: Stage
+    config: TrackingConfig
+
+
+def _follow_frames(job: _FollowJob) -> int:
+    capture, stage = read_capture(job.capture), job.stage
+    tracker = _tracker(stage.path, job.config)
+    pending = set(stage.pending(capture.frame_ids))
+    last = before = None
+    for frame_id in capture.frame_ids:
+        path = stage.frame_path(frame_id)
+        if frame_id in pending:
+            begin = time.process_time()
+            points = _points(capture, frame_id, job.config)
+            if last is None:
+                followed = tracker.begin(points, _start(tracker, job.config, frame_id))
+            else:
+                followed = tracker.follow(points, last, before)
+            _save_followed(path, followed, time.process_time() - begin)
+        followed = _load_followed(path)
+        before = last if followed.lost_frames == 0 and last is not None and last.lost_frames == 0 else None
+        last = followed
+    return len(pending)
+
+
+@lru_cache(maxsize=1)
+def _tracker(folder: Path, config: TrackingConfig) -> Tracker:
+    """One per process."""
+    return Tracker.create(load_body(folder / "body.npz"), config)
+
+
+def _points(capture: Capture, frame_id: int, config: TrackingConfig) -> ScanPoints:
+    """Points of a scan; none where it cannot be read, which loses the frame."""
+    paints = tuple(dict.fromkeys(capture.boundary_colours.values()))
+    try:
+        scan = read_scan(capture, frame_id)
+        return scan_points(
+            scan, capture.garment_colour, paints, config.sampling, source=str(scan_path(capture, frame_id))
+        )
+    except InputError:
+        if frame_id == capture.frame_ids[0]:
+            raise
+        return ScanPoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, bool))
+
+
+def _start(tracker: Tracker, config: TrackingConfig, frame_id: int) -> BodyState | None:
+    if config.start == "search":
+        return None
+    rest = tracker.model.rest_state()
+    if config.start == "rest":
+        return rest
+    poses = read_motion(Path(config.start), tracker.model.body)
+    rows = np.flatnonzero(poses.frame_ids == frame_id)
+    row = int(rows[0]) if len(rows) else 0
+    shape = np.zeros_like(rest.shape)
+    shape[: len(poses.shape)] = poses.shape[: len(shape)]
+    return BodyState(poses.rotations[row].astype(np.float64), poses.translations[row].astype(np.float64), shape)
+
+
+def _save_followed(path: Path, followed: Followed, cpu_s: float) -> None:
+    write_npz(
+        path,
+        rotations=followed.state.rotations,
+        translation=followed.state.translation,
+        shape=followed.state.shape,
+        shape_information=followed.shape_information,
+        reasons=np.array(followed.quality.reasons, np.str_),
+        numbers=np.array([followed.quality.lost, *_numbers(followed.quality).values()], np.float64),
+        started_from=np.array(followed.started_from),
+        lost_frames=followed.lost_frames,
+        doubtful_frames=followed.doubtful_frames,
+    )
+    write_json(path.parents[1] / "times" / f"{path.stem}.json", {"cpu_s": round(cpu_s, 4)})
+
+
+def _load_followed(path: Path) -> Followed:
+    with ArrayFile(path) as arrays:
+        lost, explained, median_m, inside = arrays["numbers"]
+        return Followed(
+            BodyState(arrays["rotations"], arrays["translation"], arrays["shape"]),
+            arrays["shape_information"],
+            Quality(arrays.names("reasons"), bool(lost), float(explained), float(median_m), float(inside)),
+            str(arrays["started_from"]),
+            int(arrays["lost_frames"]),
+            int(arrays["doubtful_frames"]),
+        )
+
+
+def _numbers(quality: Quality) -> Mapping[str, float]:
+    return {"explained": quality.explained, "median_m": quality.median_m, "inside": quality.inside}
+
+
+def _take_shape(stage: Stage, frame_ids: tuple[int, ...]) -> tuple[float, ...]:
+    """The shape after the last frame, which all frames have contributed to."""
+    return tuple(float(value) for value in _load_followed(stage.frame_path(frame_ids[-1])).state.shape)
+
+
+# --- second pass -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class _RefineJob:
+    capture: Path
+    stage: Stage
+    config: TrackingConfig
+    frame_id: int
+    shape: tuple[float, ...]
+
+
+def _refine_frame(job: _RefineJob) -> None:
+    capture, stage = read_capture(job.capture), job.stage
+    begin = time.process_time()
+    tracker = _tracker(stage.path, job.config)
+    first, start, around = _surroundings(capture, stage, job.frame_id)
+    start = replace(start, shape=np.array(job.shape))
+    points = _points(capture, job.frame_id, job.config)
+    refined = tracker.refine(points, start, around, interval_s=1 / capture.fps, lost=first.quality.lost)
+    _save_refined(stage, job.frame_id, first, refined, time.process_time() - begin)
+
+
+def _surroundings(capture: Capture, stage: Stage, frame_id: int) -> tuple[Followed, BodyState, list[BodyState]]:
+    """A frame after the first pass, where its second starts, and its neighbours if they are next to it and good."""
+    ids = capture.frame_ids
+    position = ids.index(frame_id)
+    own = _load_followed(stage.frame_path(frame_id))
+
+    def good(step: int) -> tuple[int, Followed] | None:
+        """The nearest frame on one side that is not lost."""
+        at = position + step
+        while 0 <= at < len(ids):
+            found = _load_followed(stage.frame_path(ids[at]))
+            if not found.quality.lost:
+                return ids[at], found
+            at += step
+        return None
+
+    back, ahead = good(-1), good(1)
+    if own.quality.lost:
+        if back and ahead:
+            share = (frame_id - back[0]) / (ahead[0] - back[0])
+            return own, between(back[1].state, ahead[1].state, share), []
+        near = back or ahead
+        return own, near[1].state if near else own.state, []
+    if back and ahead and back[0] == frame_id - 1 and ahead[0] == frame_id + 1:
+        return own, own.state, [back[1].state, ahead[1].state]
+    return own, own.state, []
+
+
+def _save_refined(stage: Stage, frame_id: int, first: Followed, refined: Refined, cpu_s: float) -> None:
+    """Metrics first: the frame counts as done once its npz is there."""
+    quality = refined.quality
+    numbers = {key: value if math.isfinite(value) else None for key, value in _numbers(quality).items()}
+    before = read_json(stage.path / "times" / f"{frame_id:06d}.json")["cpu_s"]
+    write_json(
+        stage.frame_path(frame_id, ".json", folder="metrics"),
+        {
+            "frame_id": frame_id,
+            "verdict": "lost" if quality.lost else "check" if quality.reasons else "good",
+            "reasons": list(quality.reasons),
+            **numbers,
+            "started_from": first.started_from,
+            "cpu_s": round(before + cpu_s, 4),
+        },
+    )
+    write_npz(
+        stage.frame_path(frame_id, folder="refined"),
+        rotations=refined.state.rotations.astype(np.float32),
+        translation=refined.state.translation.astype(np.float32),
+        seen=refined.seen,
+    )
+
+
+def _collect(capture: Capture, stage: Stage, shape: tuple[float, ...]) -> str:
+    """Gather the frames, close the stage."""
+    paths = [stage.frame_path(frame_id, folder="refined") for frame_id in capture.frame_ids]
+    rotations, translations = [], []
+    for path in paths:
+        with ArrayFile(path) as arrays:
+            rotations.append(arrays["rotations"])
+            translations.append(arrays["translation"])
+    names = load_body(stage.path / "body.npz").joint_names
+    save_poses(
+        stage.path / "poses.npz",
+        PoseSequence(
+            np.stack(rotations),
+            np.stack(translations),
+            np.array(shape, np.float32),
+            np.array(capture.frame_ids, np.int32),
+            capture.fps,
+            names,
+        ),
+    )
+    lines = [
+        json.dumps(read_json(stage.frame_path(frame_id, ".json", folder="metrics"))) for frame_id in capture.frame_ids
+    ]
+    write_bytes(stage.path / "metrics.jsonl", ("\n".join(lines) + "\n").encode())
+    return stage.finish([stage.path / "body.npz", stage.path / "poses.npz", *paths])

@@ -1,0 +1,123 @@
+"""Settings of body tracking, split by role. Standard library only: the command line imports this to print its help."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+__all__ = ["ColdStartConfig", "FitConfig", "SamplingConfig", "Schedule", "SequenceConfig", "TrackingConfig"]
+
+
+@dataclass(frozen=True, slots=True)
+class SamplingConfig:
+    """How many points a scan gives."""
+
+    body_cell_m: float = 0.016
+    """One point per cell of this size on skin and suit."""
+    cloth_cell_m: float = 0.028
+    """The same on the garment."""
+
+
+@dataclass(frozen=True, slots=True)
+class Schedule:
+    """The course of one fit."""
+
+    iterations: int = 4
+    """Gauss-Newton steps at most."""
+    first_scale_m: float = 0.05
+    """Distance at which a point has lost most of its weight, at first, ..."""
+    last_scale_m: float = 0.015
+    """... and in the end."""
+    stop_m: float = 1e-4
+    """The fit is done once no step moves anything farther than this."""
+
+
+@dataclass(frozen=True, slots=True)
+class FitConfig:
+    """Weights of the terms. Figures from `python -m benchmarks tracking`, on other settings of the same takes."""
+
+    point_sigma_m: float = 0.008
+    """Error of one point: noise, and what the body model cannot follow. Neighbouring points err alike, so it is larger
+    than the noise."""
+    mismatch: float = 0.25
+    """Error of a match, as a share of the distance at which points lose their weight: wide searches trust them less."""
+    turn_step: float = 0.3
+    """Levenberg damping: the turn, radians (or metres), of one step that costs as much as one standard deviation."""
+    shape_step: float = 1.0
+    """The same for shape coefficients."""
+    cloth_gap_m: float = 0.004
+    """Distance that cloth keeps from skin where it touches."""
+    cloth_pull: float = 0.02
+    """Weight of cloth points outside the body, against 1 inside: where cloth nearly touches it shows the body."""
+    cloth_pull_reach_m: float = 0.008
+    """Distance at which that weight is gone."""
+    normal_cosine: float = 0.3
+    """Points whose normal differs more from the body's are left out."""
+    limit_softness_deg: float = 4.0
+    """Overshoot of a joint limit that weighs as much as one standard deviation."""
+    shape_spread: float = 1.0
+    """Standard deviation of the shape coefficients before any scan."""
+
+
+@dataclass(frozen=True, slots=True)
+class ColdStartConfig:
+    """The search for the first pose."""
+
+    facings: int = 8
+    """Directions, all round, that the subject may face."""
+    points: int = 700
+    """Points of the scan that the search reads."""
+    survivors: int = 6
+    """Starts that are followed up with other arm poses."""
+    finalists: int = 3
+    """Starts that are fitted in full."""
+    rough: Schedule = Schedule(iterations=12, first_scale_m=0.25, last_scale_m=0.06)
+    """Of every start."""
+    arms: Schedule = Schedule(iterations=8, first_scale_m=0.12, last_scale_m=0.04)
+    """Of every arm pose tried on a survivor."""
+    full: Schedule = Schedule(iterations=25, first_scale_m=0.08, last_scale_m=0.015)
+    """Of the finalists."""
+
+
+@dataclass(frozen=True, slots=True)
+class SequenceConfig:
+    """From frame to frame."""
+
+    follow: Schedule = Schedule(iterations=4, first_scale_m=0.05, last_scale_m=0.015)
+    """Of a frame that starts from the one before."""
+    retry: Schedule = Schedule(iterations=15, first_scale_m=0.12, last_scale_m=0.015)
+    """Of a frame that this did not fit."""
+    refine: Schedule = Schedule(iterations=3, first_scale_m=0.02, last_scale_m=0.015)
+    """Of the second pass, with the one shape of the take."""
+    momentum: float = 0.9
+    """Share of the last motion that is expected to go on."""
+    motion_spread: float = 0.2
+    """Standard deviation of a joint's turn from what is expected, radians a frame."""
+    acceleration: float = 10.0
+    """How fast the turning of a joint changes, radians a second squared: the second pass draws a frame so much towards
+    the mean of its neighbours."""
+    shape_memory: float = 0.99
+    """Share of what is known about the shape that is kept from frame to frame."""
+    search_every: int = 15
+    """Lost frames between two searches for the pose."""
+    explained_m: float = 0.012
+    """A point of skin or suit is explained by the body if it is this near."""
+    check_explained: float = 0.85
+    """Frames with a smaller share of explained points are flagged."""
+    fail_explained: float = 0.6
+    """Frames with a smaller share are lost: nothing is built upon them."""
+    largest_shape: float = 3.5
+    """Frames that need a shape coefficient beyond this are flagged: the pose is wrong, or the body."""
+    least_points: int = 150
+    """Frames with fewer points on skin and suit are lost as well."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrackingConfig:
+    """Everything that decides a take's poses."""
+
+    start: str = "search"
+    """Where the first frame starts: `search` for the pose, the `rest` pose, or a motion file that holds it."""
+    sampling: SamplingConfig = field(default_factory=SamplingConfig)
+    fit: FitConfig = field(default_factory=FitConfig)
+    cold_start: ColdStartConfig = field(default_factory=ColdStartConfig)
+    sequence: SequenceConfig = field(default_factory=SequenceConfig)

@@ -1,0 +1,78 @@
+"""The tracking stage: a capture without poses gets them, and an interrupted run ends in the same files."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.dressed_body import dress_body
+from capture4d.body import pose_frame, with_shape
+from capture4d.body_anny import load_anny
+from capture4d.body_stage import load_tracking, run, tracking_digest
+from capture4d.body_tracking_config import TrackingConfig
+from capture4d.errors import InputError
+from capture4d.motion_retarget import pose_sequence
+from capture4d.records import save_body, save_poses
+from capture4d.scans import Capture, write_capture_description, write_scan
+from capture4d.types import Mesh, PoseSequence, Scan
+from capture4d.workdir import read_json
+
+CLOTH, SUIT = (47, 98, 201), (150, 152, 156)
+
+
+def dressed_capture(folder: Path, frames: int) -> PoseSequence:
+    """Noise-free scans of the built-in body that raises its arms, and the poses, which are not in the capture."""
+    body = load_anny()
+    person = with_shape(body, np.array([0.6, -0.4], np.float32))
+    rotations = np.tile(np.eye(3), (frames, len(body.joint_names), 1, 1))
+    for frame in range(frames):
+        angle = 0.05 * frame
+        turn = [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
+        rotations[frame, body.joint_names.index("upperarm01.L")] = turn
+    poses = pose_sequence(person, rotations, 30.0)
+    poses = replace(poses, frame_ids=np.arange(5, 5 + frames, dtype=np.int32))
+    capture = Capture(folder, "shell", 30.0, tuple(range(5, 5 + frames)), CLOTH, {})
+    for row, frame_id in enumerate(capture.frame_ids):
+        dressed = dress_body(pose_frame(person, poses, row), 0.1 * row)
+        bare, cloth = dressed.body, dressed.garment
+        mesh = Mesh(
+            np.concatenate([bare.vertices, cloth.vertices]),
+            np.concatenate([bare.faces, cloth.faces + np.int32(len(bare.vertices))]),
+        )
+        colours = np.array([SUIT] * len(bare.vertices) + [CLOTH] * len(cloth.vertices), np.uint8)
+        write_scan(folder / "scans" / f"{frame_id:06d}.ply", Scan(mesh, colours, frame_id, 0.0))
+    save_body(folder / "body.npz", body)
+    write_capture_description(capture)
+    return poses
+
+
+@pytest.mark.slow
+def test_a_take_is_tracked_and_a_run_that_was_cut_short_ends_the_same(tmp_path: Path) -> None:
+    truth = dressed_capture(tmp_path / "capture", 4)
+    save_poses(tmp_path / "start.npz", truth)
+    config = TrackingConfig(start=str(tmp_path / "start.npz"))
+    digest = run(tmp_path / "capture", tmp_path / "work" / "body", config)
+    body, found = load_tracking(tmp_path / "work" / "body")
+    assert found.frame_ids.tolist() == [5, 6, 7, 8]
+    here, there = with_shape(body, found.shape), with_shape(body, truth.shape)
+    for row in range(4):
+        apart = pose_frame(here, found, row).vertices() - pose_frame(there, truth, row).vertices()
+        assert np.linalg.norm(apart, axis=1).mean() < 0.006
+    metrics = read_json(tmp_path / "work" / "body" / "metrics" / "000006.json")
+    assert metrics["verdict"] == "good"
+
+    (tmp_path / "work" / "body" / "frames" / "000008.npz").unlink()
+    (tmp_path / "work" / "body" / "refined" / "000006.npz").unlink()
+    assert run(tmp_path / "capture", tmp_path / "work" / "body", config) == digest
+    assert tracking_digest(tmp_path / "work" / "body", tmp_path / "capture") == digest
+
+
+def test_a_start_that_is_no_file_and_a_stage_that_was_not_run(tmp_path: Path) -> None:
+    dressed_capture(tmp_path / "capture", 1)
+    with pytest.raises(InputError, match="expected search, rest or a motion file, found 'nowhere'"):
+        run(tmp_path / "capture", tmp_path / "work" / "body", TrackingConfig(start="nowhere"))
+    with pytest.raises(InputError, match="run: capture4d track"):
+        tracking_digest(tmp_path / "work" / "body", tmp_path / "capture")

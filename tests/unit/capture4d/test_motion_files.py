@@ -1,0 +1,148 @@
+"""Motion files: what goes out comes in again, and other skeletons move like their source."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from capture4d.body import pose_frame, with_shape
+from capture4d.body_anny import load_anny
+from capture4d.body_smpl import SMPL_JOINTS
+from capture4d.errors import InputError
+from capture4d.motion_files import read_motion, resample, write_motion
+from capture4d.motion_retarget import SMPL_TREE
+from capture4d.types import Body, Mesh, PoseSequence
+
+
+@pytest.fixture(scope="module")
+def smpl_like() -> Body:
+    """SMPL's 24 joints on a generated cloud of faces."""
+    parents = [*(parent for parent, _ in SMPL_TREE.values()), 20, 21]
+    offsets = [*(offset for _, offset in SMPL_TREE.values()), (0.08, 0, 0), (-0.08, 0, 0)]
+    joints = np.zeros((24, 3))
+    for joint, (parent, offset) in enumerate(zip(parents, offsets, strict=True)):
+        joints[joint] = np.array(offset) + (joints[parent] if parent >= 0 else 0)
+    rng = np.random.default_rng(0)
+    vertices = np.repeat(joints, 3, axis=0) + 0.03 * rng.standard_normal((72, 3))
+    return Body(
+        template=Mesh(vertices.astype(np.float32), np.arange(72, dtype=np.int32).reshape(-1, 3)),
+        shape_directions=(0.01 * rng.standard_normal((10, 72, 3))).astype(np.float32),
+        joints=joints.astype(np.float32),
+        joint_directions=(0.01 * rng.standard_normal((10, 24, 3))).astype(np.float32),
+        joint_names=tuple(SMPL_JOINTS),
+        parents=np.array(parents, np.int32),
+        skin_weights=np.repeat(np.eye(24, dtype=np.float32), 3, axis=0),
+    )
+
+
+def random_poses(body: Body, seed: int, frames: int = 5) -> PoseSequence:
+    rng = np.random.default_rng(seed)
+    joints = len(body.joint_names)
+    rotations = Rotation.from_rotvec(0.6 * rng.standard_normal((frames * joints, 3))).as_matrix()
+    return PoseSequence(
+        rotations.reshape(frames, joints, 3, 3).astype(np.float32),
+        rng.standard_normal((frames, 3)).astype(np.float32),
+        rng.standard_normal(4).astype(np.float32),
+        np.arange(frames, dtype=np.int32),
+        60.0,
+        body.joint_names,
+    )
+
+
+def centres(body: Body, poses: PoseSequence) -> np.ndarray:
+    """World joint positions (T, J, 3)."""
+    shaped = with_shape(body, poses.shape)
+    transforms = np.stack([pose_frame(shaped, poses, t).transforms for t in range(len(poses.frame_ids))])
+    return np.einsum("tjab,jb->tja", transforms[:, :, :3, :3], shaped.joints) + transforms[:, :, :3, 3]
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_bvh_round_trip_keeps_joint_positions_and_shape(tmp_path: Path, seed: int) -> None:
+    body = load_anny()
+    poses = random_poses(body, seed)
+    write_motion(tmp_path / "clip.bvh", body, poses)
+    back = read_motion(tmp_path / "clip.bvh", body)
+    assert back.fps == 60.0
+    np.testing.assert_allclose(centres(body, back), centres(body, poses), atol=1e-4)
+    np.testing.assert_allclose(back.shape[:4], poses.shape, atol=1e-3)
+
+
+def test_own_npz_round_trip_is_exact(tmp_path: Path) -> None:
+    body = load_anny()
+    poses = random_poses(body, 3)
+    write_motion(tmp_path / "poses.npz", body, poses)
+    back = read_motion(tmp_path / "poses.npz", body)
+    np.testing.assert_array_equal(back.rotations, poses.rotations)
+
+
+def test_amass_round_trip_on_a_body_of_its_family(smpl_like: Body, tmp_path: Path) -> None:
+    poses = random_poses(smpl_like, 4)
+    poses.rotations[:, 22:] = np.eye(3)
+    write_motion(tmp_path / "clip.npz", smpl_like, poses, amass=True)
+    with np.load(tmp_path / "clip.npz") as arrays:
+        assert arrays["poses"].shape == (5, 156)
+        assert float(arrays["mocap_framerate"]) == 60.0
+    back = read_motion(tmp_path / "clip.npz", smpl_like)
+    np.testing.assert_allclose(centres(smpl_like, back), centres(smpl_like, poses), atol=1e-5)
+
+
+def test_amass_is_z_up(smpl_like: Body, tmp_path: Path) -> None:
+    """SMPL stands up in AMASS by a quarter turn about x; that is our rest pose."""
+    vectors = np.zeros((2, 156))
+    vectors[:, 0] = np.pi / 2
+    root = smpl_like.joints[0].astype(float)
+    trans = np.tile([0.0, 0.0, root[1]] - root, (2, 1))
+    for rate in ("mocap_framerate", "mocap_frame_rate"):
+        np.savez(tmp_path / "clip.npz", poses=vectors, trans=trans, betas=np.zeros(16), **{rate: 120.0})
+        poses = read_motion(tmp_path / "clip.npz", smpl_like)
+        assert poses.fps == 120.0
+        np.testing.assert_allclose(poses.rotations[0], np.broadcast_to(np.eye(3), (24, 3, 3)), atol=1e-6)
+        np.testing.assert_allclose(poses.translations[0], 0.0, atol=1e-6)
+
+
+def test_amass_on_another_body_points_its_limbs_the_same_way(tmp_path: Path) -> None:
+    body = load_anny()
+    rng = np.random.default_rng(5)
+    vectors = np.zeros((3, 52, 3))
+    vectors[:, 0] = (np.pi / 2, 0, 0)
+    vectors[:, 16:19] = 0.5 * rng.standard_normal((3, 3, 3))
+    np.savez(tmp_path / "clip.npz", poses=vectors.reshape(3, -1), trans=np.zeros((3, 3)), mocap_framerate=60.0)
+    poses = read_motion(tmp_path / "clip.npz", body)
+    places = centres(body, poses)
+    index = body.joint_names.index
+    arm = places[:, index("lowerarm01.L")] - places[:, index("upperarm01.L")]
+    turned = Rotation.from_rotvec(vectors[:, 16]).apply([1.0, 0.0, 0.0])
+    np.testing.assert_allclose(arm / np.linalg.norm(arm, axis=1, keepdims=True), turned, atol=1e-5)
+
+    write_motion(tmp_path / "again.npz", body, poses, amass=True)
+    np.testing.assert_allclose(read_motion(tmp_path / "again.npz", body).rotations, poses.rotations, atol=1e-5)
+
+
+def test_resampling_at_the_same_rate_changes_nothing() -> None:
+    poses = random_poses(load_anny(), 6)
+    np.testing.assert_allclose(resample(poses, 60.0).rotations, poses.rotations, atol=1e-6)
+    doubled = resample(poses, 120.0)
+    assert len(doubled.frame_ids) == 9
+    np.testing.assert_allclose(doubled.rotations[::2], poses.rotations, atol=1e-6)
+
+
+def test_what_is_no_motion_is_named(tmp_path: Path) -> None:
+    body = load_anny()
+    with pytest.raises(InputError, match="no such motion file"):
+        read_motion(tmp_path / "none.bvh", body)
+    (tmp_path / "notes.txt").write_text("")
+    with pytest.raises(InputError, match=r"expected a motion file \.npz or \.bvh"):
+        read_motion(tmp_path / "notes.txt", body)
+    np.savez(tmp_path / "clip.npz", poses=np.zeros((2, 66)), trans=np.zeros((2, 3)))
+    with pytest.raises(InputError, match="expected a frame rate as mocap_framerate or mocap_frame_rate"):
+        read_motion(tmp_path / "clip.npz", body)
+    np.savez(tmp_path / "clip.npz", poses=np.zeros((2, 30)), trans=np.zeros((2, 3)))
+    with pytest.raises(InputError, match=r"expected poses \(T, 66 or more\)"):
+        read_motion(tmp_path / "clip.npz", body)
+    write_motion(tmp_path / "own.npz", body, replace(random_poses(body, 7), joint_names=tuple("j" * 36)))
+    with pytest.raises(InputError, match="expected the body's 36 joints"):
+        read_motion(tmp_path / "own.npz", body)
