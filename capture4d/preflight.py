@@ -59,7 +59,7 @@ ADVICE: Mapping[Code, tuple[Severity, str]] = {
     "frame-nan": ("error", "reconstruct these frames again; --fix leaves them out"),
     "frame-partial": ("warning", "look at these frames: cameras may have dropped out; --fix leaves them out"),
     "frame-repeated": ("warning", "the recorder stalled; --fix leaves the copies out"),
-    "frames-missing": ("warning", "find the frames, or accept the gap; times follow from frame numbers"),
+    "frames-missing": ("warning", "find the frames, or accept the gap, as --fix does; times follow from frame numbers"),
     "frames-duplicated": (
         "error",
         "keep one file per frame number; --fix drops equal copies, and both of unequal ones",
@@ -105,7 +105,7 @@ class Limits:
     chroma_share: float = 0.5
     """Least share of the garment's chroma that the scans must show."""
     chroma: float = 10.0
-    """Least chroma of the most colourful twentieth, where the garment's colour is not known; skin has 20."""
+    """Least chroma of the most colourful hundredth, where the garment's colour is not known; skin has 20."""
     clipped_share: float = 0.25
     garment_share: float = 0.02
     border_share: float = 0.002

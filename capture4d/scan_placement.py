@@ -167,7 +167,7 @@ def survey_take(
     else:
         axes, axes_ratio = _choose_by_mannequin(find_up(points))
         mirror_ratio = None
-    flip = sign < 0 and np.linalg.det(axes) > 0 or sign >= 0 and bool(np.linalg.det(axes) < 0)
+    flip = (sign < 0) != bool(np.linalg.det(axes) < 0)
     placed = [sample[:, :3] @ axes.T for sample in points]
     if by_poses and bodies is not None:
         floor, exact = _floor_by_poses(placed, bodies), True
@@ -175,7 +175,7 @@ def survey_take(
         floor, exact = _floor_by_feet([np.hstack([p, s[:, 3:] @ axes.T]) for p, s in zip(placed, points, strict=True)])
     lift = -floor if exact and abs(floor) > MAX_FLOOR_M else 0.0
     return Survey(
-        Placement(scale, axes, bool(flip), lift), units, size_ratio, axes_ratio, mirror_ratio, sign, floor, exact,
+        Placement(scale, axes, flip, lift), units, size_ratio, axes_ratio, mirror_ratio, sign, floor, exact,
         by_poses,
     )  # fmt: skip
 
@@ -199,7 +199,7 @@ def _choose_by_poses(fits: list[tuple[float, np.ndarray]], *, inside_out: bool) 
     turned = min(value for value, axes in costs if np.linalg.det(axes) > 0 and (axes != np.eye(3)).any())
     mirrored = min(value for value, axes in costs if np.linalg.det(axes) < 0)
     best = min(costs, key=lambda entry: entry[0])[1]
-    return best, own / turned if np.linalg.det(best) > 0 else 1.0 * min(own / turned, 1.0), own / mirrored
+    return best, own / turned, own / mirrored
 
 
 def _choose_by_mannequin(fits: dict[int, MannequinFit]) -> tuple[np.ndarray, float]:
@@ -216,7 +216,9 @@ def _floor_by_poses(placed: list[np.ndarray], bodies: Sequence[np.ndarray]) -> f
         return float(
             np.mean(
                 [
-                    np.minimum(tree.query(points + (0, rise, 0), distance_upper_bound=CLIP_M)[0], CLIP_M).mean()
+                    np.minimum(
+                        tree.query(points + np.array([0, rise, 0]), distance_upper_bound=CLIP_M)[0], CLIP_M
+                    ).mean()
                     for tree, points in zip(trees, placed, strict=True)
                 ]
             )
@@ -254,7 +256,7 @@ def sample_surface(mesh: Mesh, *, outward: bool = True, count: int = PROBE_POINT
 
 
 def find_units(size: float) -> tuple[UnitName, float]:
-    """The unit in which a subject of this size, the square root of its surface, is a person; and how far off it still is.
+    """The unit in which a subject of this size, the square root of its surface, is a person; and how far off it is.
 
     Returns:
         The unit, and the ratio of the size in it to that of a person, never below 1.

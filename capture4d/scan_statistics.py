@@ -61,7 +61,7 @@ class ColourStatistics:
     """Colours of one scan. Shares are of its vertices."""
 
     chroma: float
-    """CIELAB chroma that 5 % of the vertices exceed."""
+    """CIELAB chroma that one vertex in a hundred exceeds."""
     clipped: float
     """Share of vertices at or near white in every channel."""
     garment: float
@@ -260,14 +260,14 @@ def colour_statistics(scan: Scan, labels: UInt8[np.ndarray, " verts"], paints: P
         wanted = to_lab(np.array([paints.garment], np.uint8))[0]
         turn = np.angle((lab[:, 1] + 1j * lab[:, 2]) * (wanted[1] - 1j * wanted[2]))
         own = (np.abs(turn) < np.radians(WEDGE_DEG)) & (chroma > 2)
-        if own.mean() > 0.05:
+        if own.mean() > 0.01:
             garment_chroma = float(np.percentile(chroma[own], 75))
         if (labels == GARMENT).mean() > 0.01:
             spread = float(np.percentile(colour_angles(scan.colours[labels == GARMENT], paints.garment), 95))
     count = max(len(labels), 1)
     borders = tuple(float((labels == FIRST_PAINT + i).sum() / count) for i in range(len(paints.borders)))
     return ColourStatistics(
-        chroma=float(np.percentile(chroma, 95)) if len(chroma) else 0.0,
+        chroma=float(np.percentile(chroma, 99)) if len(chroma) else 0.0,
         clipped=float((scan.colours >= 250).all(axis=1).mean()) if len(chroma) else 0.0,
         garment=float((labels == GARMENT).mean()),
         garment_chroma=garment_chroma,

@@ -1,4 +1,4 @@
-"""A take as it lies in a folder, before anything about it is believed: which file is which frame, and what is said of it.
+"""A take as it lies in a folder, before anything about it is believed: which file is which frame, what is said of it.
 
 `capture4d.scans.read_capture` refuses a folder with a fault; here faults are what is looked for.
 """
