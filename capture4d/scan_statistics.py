@@ -67,7 +67,8 @@ class ColourStatistics:
     garment: float
     """Share of garment-coloured vertices."""
     garment_chroma: float
-    """Typical chroma of vertices of the garment's hue; NaN where there are hardly any."""
+    """Chroma that a hundredth of the vertices of the garment's hue exceed: a grey suit has some hue, but little chroma.
+    NaN where there are hardly any."""
     garment_spread: float
     """Angle in linear RGB, radians, that 95 % of the garment's vertices keep to the garment's colour; NaN likewise."""
     borders: tuple[float, ...]
@@ -261,7 +262,7 @@ def colour_statistics(scan: Scan, labels: UInt8[np.ndarray, " verts"], paints: P
         turn = np.angle((lab[:, 1] + 1j * lab[:, 2]) * (wanted[1] - 1j * wanted[2]))
         own = (np.abs(turn) < np.radians(WEDGE_DEG)) & (chroma > 2)
         if own.mean() > 0.01:
-            garment_chroma = float(np.percentile(chroma[own], 75))
+            garment_chroma = float(np.percentile(chroma[own], 99))
         if (labels == GARMENT).mean() > 0.01:
             spread = float(np.percentile(colour_angles(scan.colours[labels == GARMENT], paints.garment), 95))
     count = max(len(labels), 1)
