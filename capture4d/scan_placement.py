@@ -14,7 +14,6 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Float64
@@ -39,9 +38,8 @@ __all__ = [
     "survey_take",
 ]
 
-UnitName = Literal["m", "cm", "mm", "in"]
 
-UNITS: dict[UnitName, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+UNITS: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 """Metres in one unit."""
 SUBJECT_SIZE_M = 1.2
 """Square root of a scanned subject's surface: 0.95 m for a bare shirt, 1.5 m for a clothed person from head to toe."""
@@ -120,7 +118,7 @@ class Survey:
 
     placement: Placement
     """What brings the take to metres, Y up, faces outside, feet on the floor; only what was found to be wrong."""
-    units: UnitName | None
+    units: str | None
     """What the files are in, None if no unit makes the subject a person."""
     size_ratio: float
     """How many times too large or too small the subject is as declared, never below 1."""
@@ -255,7 +253,7 @@ def sample_surface(mesh: Mesh, *, outward: bool = True, count: int = PROBE_POINT
     return np.hstack([corners[chosen].mean(axis=1), unit])
 
 
-def find_units(size: float) -> tuple[UnitName, float]:
+def find_units(size: float) -> tuple[str, float]:
     """The unit in which a subject of this size, the square root of its surface, is a person; and how far off it is.
 
     Returns:
@@ -441,7 +439,7 @@ def _misfit(probes: list[np.ndarray], bodies: Sequence[np.ndarray], trees: list[
                 near = np.isfinite(distance)
                 misfits.append(np.minimum(distance, CLIP_M).mean())
                 if near.any():
-                    moves.append((body[nearest[near]] - points[near] - shift).mean(axis=0))
+                    moves.append((body[np.asarray(nearest)[near]] - points[near] - shift).mean(axis=0))
             best = min(best, float(np.mean(misfits)))
             if step == 3 or not moves:
                 break

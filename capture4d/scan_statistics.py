@@ -183,7 +183,7 @@ def surface_noise(mesh: Mesh) -> float:
     chosen = np.linspace(0, len(points) - 1, min(NOISE_SAMPLES, len(points))).astype(int)
     tree = KDTree(points, balanced_tree=False, compact_nodes=False)
     distance, neighbours = tree.query(points[chosen], NOISE_NEIGHBOURS + 1)
-    around = points[neighbours[:, 1:]]
+    around = points[np.asarray(neighbours)[:, 1:]]
     centre = around.mean(axis=1, keepdims=True)
     _, axes = np.linalg.eigh(np.einsum("nka,nkb->nab", around - centre, around - centre))
     off_plane = np.abs(np.einsum("na,na->n", points[chosen] - centre[:, 0], axes[:, :, 0]))
