@@ -82,7 +82,7 @@ ADVICE: Mapping[Code, tuple[Severity, str]] = {
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What is tolerated. Clean takes stay below two thirds of these (`python -m benchmarks preflight`)."""
+    """What is tolerated. The strongest score of a sound take is 0.79 (`python -m benchmarks preflight --quick`)."""
 
     floor_rough_m: float = 0.35
     """Where neither feet nor motion capture tell the floor."""
