@@ -1,4 +1,6 @@
-"""The one exception that means "the input is at fault, not the program"."""
+"""The exception that means "the input is at fault, not the program", and two faults that callers tell apart."""
+
+__all__ = ["EmptyMeshError", "InputError", "NotFiniteError"]
 
 
 class InputError(ValueError):
@@ -8,3 +10,11 @@ class InputError(ValueError):
     command line prints it without a traceback and exits with 1; every other exception is our own bug and keeps its
     traceback.
     """
+
+
+class EmptyMeshError(InputError):
+    """A mesh without faces."""
+
+
+class NotFiniteError(InputError):
+    """NaN or infinity among numbers that have to be finite."""

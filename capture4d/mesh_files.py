@@ -7,20 +7,23 @@ formats the line.
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Int32, UInt8
 
-from capture4d.errors import InputError
+from capture4d.errors import EmptyMeshError, InputError
 from capture4d.obj_format import obj_bytes, read_obj
 from capture4d.ply_format import ply_bytes, read_ply
 from capture4d.polygons import MeshFile
+from capture4d.textures import texture_colours
 from capture4d.types import Mesh
 from capture4d.workdir import write_bytes
 
-__all__ = ["MESH_SUFFIXES", "MeshFile", "read_mesh", "write_mesh"]
+__all__ = ["MESH_SUFFIXES", "MeshFile", "read_coloured_mesh", "read_mesh", "write_mesh"]
 
 MESH_SUFFIXES = (".obj", ".ply", ".glb")
 
@@ -40,10 +43,32 @@ def read_mesh(path: str | Path) -> MeshFile:
     try:
         found = read(path)
     except InputError as error:
-        raise InputError(error if str(error).startswith(str(path)) else f"{path}: {error}") from None
+        raise error if str(error).startswith(str(path)) else type(error)(f"{path}: {error}") from None
     if not len(found.mesh.faces):
-        raise InputError(f"{path}: empty mesh, found {len(found.mesh.vertices)} vertices and no faces")
+        raise EmptyMeshError(f"{path}: empty mesh, found {len(found.mesh.vertices)} vertices and no faces")
     return found
+
+
+def read_coloured_mesh(path: str | Path) -> MeshFile:
+    """Read a mesh with a colour per vertex: those of the file, else its texture's at the vertices, else None.
+
+    A texture is the one image that an obj's mtl file names as map_Kd, a ply's `comment TextureFile`, or a glb holds as
+    base colour.
+
+    Raises:
+        InputError: as `read_mesh`; or the texture is missing or damaged.
+    """
+    path = Path(path)
+    found = read_mesh(path)
+    if found.colours is not None:
+        return found
+    if path.suffix.lower() == ".glb":
+        mesh, picture = _textured_glb(path)
+    else:
+        mesh, picture = found.mesh, _texture_file(path)
+    if picture is None or mesh.uv is None:
+        return found
+    return replace(found, mesh=mesh, colours=texture_colours(mesh, _pixels(picture, path)))
 
 
 def write_mesh(
@@ -85,6 +110,54 @@ def _read_glb(path: Path) -> MeshFile:
     faces = np.asarray(mesh.faces, np.int32).reshape(-1, 3)
     uv = None if coordinates is None else np.asarray(coordinates, np.float32)[faces]
     return MeshFile(Mesh(np.asarray(mesh.vertices, np.float32).reshape(-1, 3), faces, uv), colours)
+
+
+def _textured_glb(path: Path) -> tuple[Mesh, Any]:
+    """The mesh with its UVs, and its base colour image or None."""
+    import trimesh
+
+    scene = trimesh.load_scene(path, file_type="glb", process=False)
+    model: Any = scene.to_mesh()
+    material = getattr(model.visual, "material", None)
+    uv = getattr(model.visual, "uv", None)
+    faces = np.asarray(model.faces, np.int32).reshape(-1, 3)
+    corners = None if uv is None else np.asarray(uv, np.float32)[faces]
+    mesh = Mesh(np.asarray(model.vertices, np.float32).reshape(-1, 3), faces, corners)
+    return mesh, getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+
+
+def _texture_file(path: Path) -> Path | None:
+    """The one image that the head of an obj (by its mtl) or a ply names."""
+    with path.open("rb") as file:
+        head = file.read(65_536).decode("utf-8", errors="replace")
+    if path.suffix.lower() == ".ply":
+        names = re.findall(r"^comment TextureFile (.+?)\s*$", head.partition("end_header")[0], re.M)
+    else:
+        names = []
+        for library in re.findall(r"^mtllib (.+?)\s*$", head, re.M):
+            materials = path.parent / library
+            if not materials.is_file():
+                raise InputError(f"{materials}: no such file, the materials of {path.name}")
+            lines = materials.read_text(encoding="utf-8", errors="replace")
+            names += re.findall(r"^\s*map_Kd (?:-\S+ \S+ )*(.+?)\s*$", lines, re.M)
+    textures = sorted({path.parent / name for name in names})
+    if len(textures) > 1:
+        raise InputError(f"{path}: expected one texture, found {', '.join(texture.name for texture in textures)}")
+    return textures[0] if textures else None
+
+
+def _pixels(picture: Any, path: Path) -> UInt8[np.ndarray, "rows columns 3"]:
+    from PIL import Image, UnidentifiedImageError
+
+    if not isinstance(picture, Path):
+        return np.array(picture.convert("RGB"))
+    if not picture.is_file():
+        raise InputError(f"{picture}: no such file, the texture of {path.name}")
+    try:
+        with Image.open(picture) as image:
+            return np.array(image.convert("RGB"))
+    except (UnidentifiedImageError, OSError) as error:
+        raise InputError(f"{picture}: not a readable image ({_one_line(error)})") from None
 
 
 def _glb_bytes(mesh: Mesh, colours: np.ndarray | None) -> bytes:

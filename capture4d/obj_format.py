@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from capture4d.errors import InputError
+from capture4d.errors import InputError, NotFiniteError
 from capture4d.polygons import MeshFile, colour_bytes, polygon_corners, polygon_mesh
 from capture4d.types import Mesh
 
@@ -51,7 +51,7 @@ def read_obj(path: Path) -> MeshFile:
                         corners.append(_index(vertex, len(vertices)))
                         corner_texture.append(_index(uv, len(texture)) if uv else -1)
             except InputError as error:
-                raise InputError(f"{path}:{number}: {error}") from None
+                raise type(error)(f"{path}:{number}: {error}") from None
 
     size_of = np.array(sizes, np.int64)
     corner_of = np.array(corners, np.int64)
@@ -82,7 +82,7 @@ def _numbers(fields: list[str], *, at_least: int) -> list[float]:
     if len(numbers) < at_least:
         raise InputError(f"expected at least {at_least} numbers, found {len(numbers)}")
     if not np.isfinite(numbers).all():
-        raise InputError(f"expected finite numbers, found '{' '.join(fields)}'")
+        raise NotFiniteError(f"expected finite numbers, found '{' '.join(fields)}'")
     return numbers
 
 

@@ -25,7 +25,7 @@ from jaxtyping import Float32, Int32, UInt8
 
 from capture4d.errors import InputError
 from capture4d.mesh import boundary_loops
-from capture4d.mesh_files import MESH_SUFFIXES, read_mesh, write_mesh
+from capture4d.mesh_files import MESH_SUFFIXES, read_coloured_mesh, read_mesh, write_mesh
 from capture4d.records import (
     ArrayFile,
     load_body,
@@ -78,8 +78,8 @@ _FORMAT = 1
 Colour = tuple[int, int, int]
 """sRGB, 0 to 255."""
 
-Units = Literal["m", "cm", "mm"]
-_METRES: dict[Units, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+Units = Literal["m", "cm", "mm", "in"]
+_METRES: dict[Units, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -232,12 +232,12 @@ def read_scan(capture: Capture, frame_id: int) -> Scan:
     """Read one frame, in metres.
 
     Raises:
-        InputError: the scan is missing, damaged, or has no vertex colours.
+        InputError: the scan is missing, damaged, or has neither vertex colours nor a texture.
     """
     path = scan_path(capture, frame_id)
-    found = read_mesh(path)
+    found = read_coloured_mesh(path)
     if found.colours is None:
-        raise InputError(f"{path}: expected a colour per vertex, found none")
+        raise InputError(f"{path}: expected a colour per vertex, found none, nor a texture")
     mesh = found.mesh
     if capture.units != "m":
         mesh = mesh.with_vertices(mesh.vertices * np.float32(_METRES[capture.units]))

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Int32, UInt8
 
-from capture4d.errors import InputError
+from capture4d.errors import InputError, NotFiniteError
 
 __all__ = [
     "Body",
@@ -44,7 +44,7 @@ def _require_array(owner: str, name: str, value: Any, shape: tuple[int | None, .
 def _require_finite(owner: str, name: str, value: np.ndarray) -> None:
     if not np.isfinite(value).all():
         bad = int(np.count_nonzero(~np.isfinite(value).reshape(len(value), -1).all(axis=1)))
-        raise InputError(f"{owner}.{name}: expected finite numbers, found NaN or inf in {bad} of {len(value)} rows")
+        raise NotFiniteError(f"{owner}.{name}: expected finite numbers, found NaN or inf in {bad} of {len(value)} rows")
 
 
 def _require_indices(owner: str, name: str, value: np.ndarray, count: int) -> None:

@@ -1,7 +1,7 @@
 """The `capture4d` command: one subcommand per stage, and `run` for all of them.
 
 Bad input ends in one line on stderr and exit code 1, a broken limit in exit code 1, a wrong command line in 2, Ctrl-C
-in 130; anything else is a bug and keeps its traceback.
+in 130; `check` grades a take by 0, 1 and 2; anything else is a bug and keeps its traceback.
 """
 
 from __future__ import annotations
@@ -109,6 +109,65 @@ class Scan(_Stage):
         )
         print(f"capture: {self.output}")
         return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check:
+    """Look through a take before a night is spent on it; exit code 0: clean, 1: warnings, 2: errors."""
+
+    capture: Annotated[Positional[Path], arg(metavar="CAPTURE")]
+    """Capture folder, or just a folder of scans."""
+    frames: str | None = None
+    """How scans are named, such as "take_{frame}.ply"; else the last number in a name is the frame's."""
+    fps: float | None = None
+    """Frame rate, if capture.json does not say, or is to be doubted."""
+    units: Literal["m", "cm", "mm", "in"] | None = None
+    """What the scans are said to be in, likewise."""
+    garment_colour: str | None = None
+    """Such as #2f62c9, likewise."""
+    border_colour: UseAppendAction[tuple[str, ...]] = ()
+    """A paint on the borders, likewise; may be given several times."""
+    rig: Path | None = None
+    """rig.json, if it is not in the folder."""
+    poses: Path | None = None
+    """poses.npz, likewise."""
+    body: Path | None = None
+    """body.npz, likewise."""
+    all: bool = False
+    """Look at every frame instead of a sample."""
+    fix: bool = False
+    """Write a corrected take to CAPTURE-fixed; looks at every frame."""
+    json: bool = False
+    """Print JSON instead of a table."""
+    workers: int = field(default_factory=_all_cores)
+    """Processes to use; the result does not depend on it."""
+
+    def __call__(self) -> int:
+        import json
+
+        from capture4d.app.check import as_json, check_take, exit_code, print_table
+        from capture4d.app.check_fix import write_fixed
+        from capture4d.app.check_take import Claims
+
+        claims = Claims(
+            self.frames,
+            self.fps,
+            self.units,
+            self.garment_colour,
+            self.border_colour,
+            self.rig,
+            self.poses,
+            self.body,
+        )
+        checked = check_take(self.capture, claims, all_frames=self.all or self.fix, workers=self.workers)
+        fixed = write_fixed(checked, workers=self.workers) if self.fix and checked.verdict.findings else None
+        if self.json:
+            print(json.dumps(as_json(checked, fixed=fixed), indent=2))
+        else:
+            print_table(checked)
+            if fixed is not None:
+                print(f"corrected: {fixed}")
+        return exit_code(checked.verdict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -384,6 +443,7 @@ _COMMANDS: Mapping[str, Any] = {
     "demo": Demo,
     "synth": Synth,
     "scan": Scan,
+    "check": Check,
     "extract": Extract,
     "track": Track,
     "register": Register,

@@ -1,0 +1,272 @@
+"""`capture4d check`: look through a take before a night is spent on it.
+
+Two passes. A few frames tell the coordinates (`capture4d.scan_placement`); then frames are streamed, two in memory at a
+time, and become a few numbers each (`capture4d.scan_statistics`), from which `capture4d.preflight` judges.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from capture4d.app.check_take import Claims, TakeFolder, open_take, posed_body, read_frame, time_stamp
+from capture4d.preflight import BadFrame, Verdict, judge, true_rate
+from capture4d.scan_placement import Placement, Survey, place, place_rig, sample_surface, survey_take
+from capture4d.scan_statistics import FrameStatistics, Paints, camera_counts, measure_frame, surface_shift
+from capture4d.types import Mesh, Rig, Scan
+from capture4d.workdir import run_jobs
+
+__all__ = ["Checked", "as_json", "check_take", "exit_code", "print_table"]
+
+PROBES = 4
+PAIRS = 30
+"""Pairs of consecutive frames that a sample holds."""
+SUSPECTS = 60
+"""Files of odd sizes that a sample holds beyond that."""
+RUN = 16
+"""Frames of a job."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Checked:
+    """A take that was looked through."""
+
+    take: TakeFolder
+    survey: Survey | None
+    verdict: Verdict
+    frames: int
+    """Looked at."""
+    rig_moves: bool
+    """The rig is in the coordinates of the scans, whatever those are."""
+    rate: float | None
+    """Frames a second by motion capture or time stamps."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Job:
+    files: tuple[tuple[int, Path], ...]
+    before: tuple[int, Path] | None
+    placement: Placement
+    paints: Paints
+    rig: Rig | None
+    poses_path: Path | None
+    body_path: Path | None
+
+
+def check_take(path: Path, claims: Claims | None = None, *, all_frames: bool = False, workers: int = 1) -> Checked:
+    """Look through a take.
+
+    Raises:
+        InputError: there is nothing to look at, or a description, rig or body cannot be read.
+    """
+    take = open_take(path, claims)
+    survey = _survey(take)
+    placement = Placement(take.facts.declared) if survey is None else survey.placement
+    rig, rig_moves = take.rig, False
+    if survey is not None and take.rig is not None:
+        rig, rig_moves = _rig_of_scans(take, placement)
+    chosen = list(take.files) if all_frames else _sample(take)
+    frames: list[FrameStatistics] = []
+    bad: list[BadFrame] = []
+    for statistics, unreadable in run_jobs(
+        _measure_run,
+        _jobs(take, chosen, placement, rig),
+        workers=workers,
+        label="Checking",
+        units=lambda job: len(job.files),
+    ):
+        frames += statistics
+        bad += unreadable
+    verdict = judge(take.facts, survey, frames, bad)
+    return Checked(
+        take,
+        survey,
+        verdict,
+        len(chosen),
+        rig_moves,
+        true_rate(take.facts, sorted(frames, key=lambda frame: frame.frame_id)),
+    )
+
+
+def _survey(take: TakeFolder) -> Survey | None:
+    """Coordinates from the first readable frames of equal parts of the take."""
+    posed = take.facts.pose_frames
+    has_body = take.poses_path is not None and take.body_path is not None
+    known = [number for number in take.files if not (has_body and posed) or number in set(posed or ())]
+    candidates = known or list(take.files)
+    probes: list[tuple[int, Mesh]] = []
+    for part in np.array_split(np.array(candidates), min(PROBES, len(candidates))):
+        for number in part[:20].tolist():
+            found = read_frame(take.files[number], number)
+            if not isinstance(found, BadFrame):
+                probes.append((number, found.mesh))
+                break
+    if not probes:
+        return None
+    bodies = None
+    if known and take.poses_path is not None and take.body_path is not None:
+        posed_bodies = [posed_body(take.poses_path, take.body_path, number) for number, _ in probes]
+        bodies = [body for body in posed_bodies if body is not None]
+    return survey_take([mesh for _, mesh in probes], take.facts.declared, bodies or None)
+
+
+def _rig_of_scans(take: TakeFolder, placement: Placement) -> tuple[Rig, bool]:
+    """The rig in metres with Y up, and whether it had to be moved there: the one that looks at the scan."""
+    assert take.rig is not None
+    factor = placement.scale / take.facts.declared
+    if not placement.moves and factor == 1:
+        return take.rig, False
+    found = next(
+        found
+        for number, file in take.files.items()
+        if not isinstance(found := read_frame(file, number), BadFrame)
+    )  # fmt: skip
+    as_is = sample_surface(found.mesh)[:, :3] * take.facts.declared
+    placed = sample_surface(place(found.mesh, placement))[:, :3]
+    if camera_counts(take.rig, placed).mean() >= camera_counts(take.rig, as_is).mean() or placement.mirrors:
+        return take.rig, False
+    return place_rig(take.rig, placement, scale=factor), True
+
+
+def _sample(take: TakeFolder) -> list[int]:
+    """Pairs of consecutive frames all along the take, and files whose size is odd."""
+    numbers = list(take.files)
+    if len(numbers) <= 2 * PAIRS:
+        return numbers
+    starts = np.linspace(0, len(numbers) - 2, PAIRS).astype(int)
+    chosen = {int(index) for start in starts for index in (start, start + 1)}
+    size = np.array([file.stat().st_size for file in take.files.values()])
+    small = np.flatnonzero(size < 0.5 * np.median(size))
+    same = np.flatnonzero(np.diff(size) == 0)
+    # Scans of one topology all have one size, which says nothing.
+    if len(same) > 0.1 * len(size):
+        same = same[:0]
+    for index in small[:SUSPECTS].tolist():
+        chosen.add(index)
+    for index in same[: SUSPECTS // 2].tolist():
+        chosen |= {index, index + 1}
+    return [numbers[index] for index in sorted(chosen)]
+
+
+def _jobs(take: TakeFolder, chosen: Sequence[int], placement: Placement, rig: Rig | None) -> list[_Job]:
+    """Runs of consecutive frames; each knows the frame before it, so that where runs end does not matter."""
+    index = {number: place for place, number in enumerate(take.files)}
+    numbers = list(take.files)
+    runs: list[list[int]] = []
+    for number in chosen:
+        if runs and len(runs[-1]) < RUN and index[number] == index[runs[-1][-1]] + 1:
+            runs[-1].append(number)
+        else:
+            runs.append([number])
+    wanted = set(chosen)
+    jobs = []
+    for run in runs:
+        before = numbers[index[run[0]] - 1] if index[run[0]] else None
+        jobs.append(
+            _Job(
+                files=tuple((number, take.files[number]) for number in run),
+                before=None if before is None or before not in wanted else (before, take.files[before]),
+                placement=placement,
+                paints=take.facts.paints,
+                rig=rig,
+                poses_path=take.poses_path if take.body_path else None,
+                body_path=take.body_path,
+            )
+        )
+    return jobs
+
+
+def _measure_run(job: _Job) -> tuple[list[FrameStatistics], list[BadFrame]]:
+    statistics: list[FrameStatistics] = []
+    bad: list[BadFrame] = []
+    before: tuple[int, Mesh] | None = None
+    if job.before is not None:
+        number, file = job.before
+        found = read_frame(file, number)
+        before = None if isinstance(found, BadFrame) else (number, place(found.mesh, job.placement))
+    for number, file in job.files:
+        found = read_frame(file, number)
+        if isinstance(found, BadFrame):
+            bad.append(found)
+            before = None
+            continue
+        mesh = place(found.mesh, job.placement)
+        colours = found.colours
+        if colours is not None and (colours == colours[0]).all():
+            colours = None
+        filler = np.zeros((len(mesh.vertices), 3), np.uint8)
+        scan = Scan(mesh, filler if colours is None else colours, number, 0.0)
+        body = None
+        if job.poses_path is not None and job.body_path is not None:
+            body = posed_body(job.poses_path, job.body_path, number)
+        frame = measure_frame(scan, job.paints, rig=job.rig, body=body, has_colours=colours is not None)
+        frame = replace(frame, time_s=time_stamp(file))
+        if before is not None:
+            frame = replace(frame, shift_m=surface_shift(before[1], mesh), shift_from=before[0])
+        statistics.append(frame)
+        before = number, mesh
+    return statistics, bad
+
+
+# --- what is said ------------------------------------------------------------------------------------------------
+
+
+def exit_code(verdict: Verdict) -> int:
+    """0 clean, 1 warnings, 2 errors."""
+    return max((2 if finding.severity == "error" else 1 for finding in verdict.findings), default=0)
+
+
+def as_json(checked: Checked, *, fixed: Path | None = None) -> dict[str, Any]:
+    """The verdict for machines; docs/preflight.md describes it."""
+    return {
+        "format": 1,
+        "capture": str(checked.take.path),
+        "status": ("clean", "warnings", "errors")[exit_code(checked.verdict)],
+        "frames": len(checked.take.files),
+        "frames_checked": checked.frames,
+        "findings": [
+            {
+                "code": finding.code,
+                "severity": finding.severity,
+                "found": finding.found,
+                "advice": finding.advice,
+                "score": round(finding.score, 3),
+                "frames": list(finding.frames),
+            }
+            for finding in checked.verdict.findings
+        ],
+        "scores": {code: round(score, 3) for code, score in checked.verdict.scores.items()},
+        "fixed": None if fixed is None else str(fixed),
+    }
+
+
+def print_table(checked: Checked) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    looked = f"{checked.frames} of {len(checked.take.files)} frames"
+    if not checked.verdict.findings:
+        console.print(f"{checked.take.path}: clean ({looked} looked at)", highlight=False, soft_wrap=True)
+        return
+    table = Table("", "finding", "what was found", "what to do", title=f"{checked.take.path} ({looked} looked at)")
+    for finding in checked.verdict.findings:
+        frames = f"\nframes {_ranges(finding.frames)}" if finding.frames else ""
+        table.add_row(finding.severity, finding.code, finding.found + frames, finding.advice)
+    console.print(table)
+
+
+def _ranges(numbers: Sequence[int], most: int = 6) -> str:
+    """'3-5, 9, ...'"""
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][1] + 1:
+            runs[-1][1] = number
+        else:
+            runs.append([number, number])
+    shown = [str(a) if a == b else f"{a}-{b}" for a, b in runs[:most]]
+    return ", ".join(shown + ["..."] * (len(runs) > most))

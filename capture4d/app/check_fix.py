@@ -1,0 +1,134 @@
+"""`capture4d check --fix`: the take again, without what is safely repaired. The original is only read.
+
+Scans are rewritten in metres, Y up, faces outside, feet on the floor; frames that cannot be used are left out and named
+in capture.json as dropped. Frame numbers stay: a frame's time follows from its number. What needs a person's judgement
+(paint, light, calibration, other people's poses) stays as it is.
+"""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from capture4d.app.check import Checked
+from capture4d.app.check_take import TakeFolder, read_frame
+from capture4d.errors import InputError
+from capture4d.mesh_files import MESH_SUFFIXES, read_mesh, write_mesh
+from capture4d.preflight import BadFrame
+from capture4d.records import save_rig
+from capture4d.scan_placement import Placement, place, place_rig
+from capture4d.workdir import run_jobs, write_json
+
+__all__ = ["fixed_path", "write_fixed"]
+
+UNUSABLE = ("frame-partial", "frame-repeated", "scale-jump", "poses-missing")
+"""Findings whose frames are left out; frames that cannot be read are left out anyway."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Job:
+    frame_id: int
+    source: Path
+    target: Path
+    placement: Placement
+
+
+def fixed_path(capture: Path) -> Path:
+    return capture.parent / f"{capture.resolve().name}-fixed"
+
+
+def write_fixed(checked: Checked, *, workers: int = 1) -> Path:
+    """Write the corrected take next to the original; the new folder.
+
+    Raises:
+        InputError: the folder exists, or no frame is left.
+    """
+    take, output = checked.take, fixed_path(checked.take.path)
+    if output.exists():
+        raise InputError(f"{output}: already there, expected to write the corrected take there; remove it first")
+    if checked.survey is None:
+        raise InputError(f"{take.path}: no readable frame, nothing to correct")
+    placement = checked.survey.placement
+    kept = [number for number in take.files if number not in _unusable(checked)]
+    if not kept:
+        raise InputError(f"{take.path}: no usable frame, nothing to correct")
+    (output / "scans").mkdir(parents=True)
+    jobs = [_Job(n, take.files[n], output / "scans" / f"{n:06d}.ply", placement) for n in kept]
+    written = sorted(number for number in run_jobs(_rewrite, jobs, workers=workers, label="Correcting") if number >= 0)
+    _copy_companions(checked, output)
+    write_json(output / "capture.json", _description(checked, written))
+    return output
+
+
+def _unusable(checked: Checked) -> set[int]:
+    frames = {
+        number
+        for finding in checked.verdict.findings
+        if finding.code in UNUSABLE or finding.code.startswith("frame-")
+        for number in finding.frames
+    }
+    take = checked.take
+    return frames | {number for number, others in take.also.items() if not _all_equal(take, number, others)}
+
+
+def _all_equal(take: TakeFolder, number: int, others: tuple[Path, ...]) -> bool:
+    first = read_frame(take.files[number], number)
+    for path in others:
+        second = read_frame(path, number)
+        if isinstance(first, BadFrame) or isinstance(second, BadFrame):
+            return False
+        if not np.array_equal(first.mesh.vertices, second.mesh.vertices):
+            return False
+    return True
+
+
+def _rewrite(job: _Job) -> int:
+    """The frame's number, or -1 where its file cannot be read."""
+    found = read_frame(job.source, job.frame_id)
+    if isinstance(found, BadFrame):
+        return -1
+    mesh = place(found.mesh, job.placement)
+    write_mesh(
+        job.target, mesh if found.colours is None else type(mesh)(mesh.vertices, mesh.faces), colours=found.colours
+    )
+    return job.frame_id
+
+
+def _copy_companions(checked: Checked, output: Path) -> None:
+    """Motion capture, template and rig; a rig, or a bare template, moves as the scans it belongs to."""
+    take = checked.take
+    assert checked.survey is not None
+    placement = checked.survey.placement
+    for source, name in (
+        (take.poses_path, "poses.npz"),
+        (take.body_path, "body.npz"),
+        (take.path / "template.npz", "template.npz"),
+    ):
+        if source is not None and source.is_file():
+            shutil.copyfile(source, output / name)
+    for suffix in MESH_SUFFIXES:
+        bare = take.path / f"template{suffix}"
+        if bare.is_file():
+            found = read_mesh(bare)
+            sized = found.mesh.with_vertices(found.mesh.vertices * np.float32(placement.scale))
+            write_mesh(output / bare.name, sized, colours=found.colours, polygon_sizes=found.polygon_sizes)
+    if take.rig is not None:
+        factor = placement.scale / take.facts.declared
+        save_rig(output / "rig.json", place_rig(take.rig, placement, scale=factor) if checked.rig_moves else take.rig)
+
+
+def _description(checked: Checked, written: list[int]) -> dict[str, Any]:
+    take = checked.take
+    description = {"format": 1, "name": take.path.resolve().name, **take.description, "units": "m", "frames": written}
+    fps = take.facts.fps
+    if any(finding.code == "fps" for finding in checked.verdict.findings) and checked.rate is not None:
+        fps = checked.rate
+    if fps is not None:
+        description["fps"] = fps
+    missing = next((f.frames for f in checked.verdict.findings if f.code == "frames-missing"), ())
+    dropped = {*take.facts.dropped, *missing, *take.files} - set(written)
+    return {**description, "dropped_frames": sorted(dropped)}

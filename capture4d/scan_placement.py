@@ -1,0 +1,447 @@
+"""Where a take's coordinates come from: its units, which way is up, whether it is mirrored or inside out.
+
+Told from a few frames of a standing person in clothes. Size comes from the surface. Without motion capture, up is the
+direction in which a rough mannequin (head on top, trunk, legs; arms wherever they may be) fits best. With it, all 48
+ways to swap and turn over the axes are tried against the posed bodies; that also finds a mirrored take, which nothing
+else can tell from one whose faces wind the wrong way round.
+
+Letters: N points, P probe frames. A placement maps file coordinates to metres, Y up: `scale * axes @ x`.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+
+import numpy as np
+from jaxtyping import Float, Float64
+from scipy.spatial import KDTree
+
+from capture4d.mesh import face_areas
+from capture4d.scan_statistics import outwardness
+from capture4d.types import Mesh, Rig
+
+__all__ = [
+    "UNITS",
+    "MannequinFit",
+    "Placement",
+    "Survey",
+    "find_units",
+    "find_up",
+    "fit_mannequin",
+    "fit_posed_bodies",
+    "place",
+    "place_rig",
+    "sample_surface",
+    "survey_take",
+]
+
+
+UNITS: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+"""Metres in one unit."""
+SUBJECT_SIZE_M = 1.2
+"""Square root of a scanned subject's surface: 0.95 m for a bare shirt, 1.5 m for a clothed person from head to toe."""
+MAX_SIZE_RATIO = 1.65
+"""Beyond this a subject is no person in the declared unit; inches taken for centimetres are off by 2.54."""
+FAULT = 1.12
+"""A fault is believed if it explains the frames better by this factor."""
+TRUSTED_POSES_M = 0.035
+"""Motion capture that fits no better than this, whatever the axes, is not of this take."""
+MAX_FLOOR_M = 0.05
+FEET_SEEN_M = 0.3
+"""A scan that ends less than this above the mannequin's soles shows the feet."""
+MANNEQUIN_SINKS_M = 0.13
+"""The mannequin comes to stand this much too low: clothes and hair make people look larger."""
+SOLE_LOST_M = 0.03
+"""Soles are not scanned; a scan ends at the edge of the foot."""
+PROBE_POINTS = 200
+CLIP_M = 0.12
+"""A point farther from the mannequin is simply not explained by it."""
+NORMAL_M = 0.06
+"""A unit of difference between normals counts as much as this distance."""
+SCALE_RANGE = (0.8, 1.2)
+"""Sizes of adults relative to the mannequin's 1.72 m."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placement:
+    """How file coordinates become metres with Y up and the floor at 0."""
+
+    scale: float = 1.0
+    axes: Float64[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
+    """Signed permutation of the axes; determinant -1 mirrors."""
+    flip: bool = False
+    """The faces wind the wrong way round in the file's own axes."""
+    lift_m: float = 0.0
+
+    @property
+    def mirrors(self) -> bool:
+        return bool(np.linalg.det(self.axes) < 0)
+
+    @property
+    def moves(self) -> bool:
+        """Anything changes but the scale."""
+        return bool(self.flip or self.lift_m or (self.axes != np.eye(3)).any())
+
+
+def place(mesh: Mesh, placement: Placement) -> Mesh:
+    """The mesh in metres, Y up, its faces wound as seen from outside."""
+    transform = (placement.scale * placement.axes).astype(np.float32)
+    vertices = mesh.vertices @ transform.T + np.array([0, placement.lift_m, 0], np.float32)
+    if not placement.flip:
+        return Mesh(vertices, mesh.faces, mesh.uv)
+    uv = None if mesh.uv is None else np.ascontiguousarray(mesh.uv[:, ::-1])
+    return Mesh(vertices, np.ascontiguousarray(mesh.faces[:, ::-1]), uv)
+
+
+def place_rig(rig: Rig, placement: Placement, *, scale: float = 1.0) -> Rig:
+    """The rig moved with its scans: `scale` is that of the coordinates of the rig, metres if 1.
+
+    A mirrored world has no cameras, so a mirroring placement leaves the rig alone.
+    """
+    if placement.mirrors:
+        return rig
+    T = rig.T_camera_world.copy()
+    rotation = T[:, :3, :3] @ placement.axes.T
+    centres = -np.einsum("cba,cb->ca", T[:, :3, :3], T[:, :3, 3])
+    moved = scale * centres @ placement.axes.T + (0, placement.lift_m, 0)
+    T[:, :3, :3] = rotation
+    T[:, :3, 3] = -np.einsum("cab,cb->ca", rotation, moved)
+    return replace(rig, T_camera_world=T)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Survey:
+    """What a few frames say about the coordinates of a take. Ratios are 1 where there is nothing to say."""
+
+    placement: Placement
+    """What brings the take to metres, Y up, faces outside, feet on the floor; only what was found to be wrong."""
+    units: str | None
+    """What the files are in, None if no unit makes the subject a person."""
+    size_ratio: float
+    """How many times too large or too small the subject is as declared, never below 1."""
+    axes_ratio: float
+    """Misfit as the axes are, over the misfit of the best other rotation of them."""
+    mirror_ratio: float | None
+    """The same for mirrored axes; None without motion capture, which alone tells."""
+    outwardness: float
+    """As the file's faces wind; negative is inside out."""
+    floor_m: float
+    """Height of the floor, once the axes are right."""
+    floor_exact: bool
+    """The feet were seen, or motion capture tells; else the floor is known to a hand's breadth or two."""
+    by_poses: bool
+
+
+def survey_take(
+    probes: Sequence[Mesh], declared: float, bodies: Sequence[Float[np.ndarray, "verts 3"]] | None = None
+) -> Survey:
+    """Find units, axes, handedness, winding and floor.
+
+    Args:
+        probes: scans of a few frames as their files have them.
+        declared: metres in a unit of the files, as the capture says.
+        bodies: posed body surface of each, metres.
+    """
+    size = float(np.median([np.sqrt(_area(mesh)) for mesh in probes]))
+    ratio = size * declared / SUBJECT_SIZE_M
+    size_ratio = max(ratio, 1 / max(ratio, 1e-12))
+    units, scale = next((name for name, metres in UNITS.items() if metres == declared), None), declared
+    if size_ratio > MAX_SIZE_RATIO:
+        units, left = find_units(size)
+        scale = UNITS[units]
+        if left > MAX_SIZE_RATIO:
+            units, scale = None, SUBJECT_SIZE_M / max(size, 1e-12)
+    sign = float(np.median([outwardness(mesh) for mesh in probes]))
+    points = [sample_surface(mesh, outward=sign >= 0) for mesh in probes]
+    points = [np.hstack([scale * sample[:, :3], sample[:, 3:]]) for sample in points]
+
+    fits = [] if bodies is None else fit_posed_bodies([sample[:, :3] for sample in points], bodies)
+    by_poses = bool(fits) and fits[0][0] < TRUSTED_POSES_M
+    if by_poses:
+        axes, axes_ratio, mirror_ratio = _choose_by_poses(fits, inside_out=sign < 0)
+    else:
+        axes, axes_ratio = _choose_by_mannequin(find_up(points))
+        mirror_ratio = None
+    flip = (sign < 0) != bool(np.linalg.det(axes) < 0)
+    placed = [sample[:, :3] @ axes.T for sample in points]
+    if by_poses and bodies is not None:
+        floor, exact = _floor_by_poses(placed, bodies), True
+    else:
+        floor, exact = _floor_by_feet([np.hstack([p, s[:, 3:] @ axes.T]) for p, s in zip(placed, points, strict=True)])
+    lift = -floor if exact and abs(floor) > MAX_FLOOR_M else 0.0
+    return Survey(
+        Placement(scale, axes, flip, lift), units, size_ratio, axes_ratio, mirror_ratio, sign, floor, exact,
+        by_poses,
+    )  # fmt: skip
+
+
+def _area(mesh: Mesh) -> float:
+    return float(face_areas(mesh.vertices.astype(np.float64), mesh.faces).sum())
+
+
+def _choose_by_poses(fits: list[tuple[float, np.ndarray]], *, inside_out: bool) -> tuple[np.ndarray, float, float]:
+    """The axes, and how much better than the file's own the best rotation and the best mirroring of them are.
+
+    Each fault costs `FAULT`: other axes, and faces that would have to be turned over.
+    """
+
+    def cost(misfit: float, axes: np.ndarray) -> float:
+        flipped = inside_out != (np.linalg.det(axes) < 0)
+        return misfit * (1 if (axes == np.eye(3)).all() else FAULT) * (FAULT if flipped else 1)
+
+    costs = [(cost(misfit, axes), axes) for misfit, axes in fits]
+    own = next(value for value, axes in costs if (axes == np.eye(3)).all())
+    turned = min(value for value, axes in costs if np.linalg.det(axes) > 0 and (axes != np.eye(3)).any())
+    mirrored = min(value for value, axes in costs if np.linalg.det(axes) < 0)
+    best = min(costs, key=lambda entry: entry[0])[1]
+    return best, own / turned, own / mirrored
+
+
+def _choose_by_mannequin(fits: dict[int, MannequinFit]) -> tuple[np.ndarray, float]:
+    costs = {up: fit.misfit_m * {1: 1.0, 4: FAULT}.get(up, 1.06) for up, fit in fits.items()}
+    other = min(cost for up, cost in costs.items() if up != 1)
+    return upright(min(costs, key=lambda up: costs[up])), costs[1] / other
+
+
+def _floor_by_poses(placed: list[np.ndarray], bodies: Sequence[np.ndarray]) -> float:
+    """How much too high the scans stand: their lift over the posed bodies, and that of the bodies over the floor."""
+    trees = [KDTree(np.asarray(body, np.float64)) for body in bodies]
+
+    def misfit(rise: float) -> float:
+        return float(
+            np.mean(
+                [
+                    np.minimum(
+                        tree.query(points + np.array([0, rise, 0]), distance_upper_bound=CLIP_M)[0], CLIP_M
+                    ).mean()
+                    for tree, points in zip(trees, placed, strict=True)
+                ]
+            )
+        )
+
+    rises = np.arange(-1.6, 1.601, 0.08)
+    rise = min(rises, key=lambda value: (misfit(value), abs(value)))
+    for step in (0.03, 0.012, 0.005):
+        rise = min((rise - 2 * step, rise - step, rise, rise + step, rise + 2 * step), key=misfit)
+    return float(np.median([body[:, 1].min() for body in bodies])) - float(rise)
+
+
+def _floor_by_feet(placed: list[np.ndarray]) -> tuple[float, bool]:
+    """The floor under feet that were scanned, or else under those of a mannequin."""
+    lowest = float(np.median([np.percentile(points[:, 1], 0.5) for points in placed]))
+    sole = float(np.median([fit_mannequin(points).sole_m for points in placed])) + MANNEQUIN_SINKS_M
+    if lowest - sole < FEET_SEEN_M:
+        return lowest - SOLE_LOST_M, True
+    return sole, False
+
+
+def sample_surface(mesh: Mesh, *, outward: bool = True, count: int = PROBE_POINTS) -> Float64[np.ndarray, "N 6"]:
+    """Points spread evenly over the area of a surface, the same ones every time, with normals times `NORMAL_M`.
+
+    Args:
+        outward: the faces wind counter-clockwise seen from outside.
+    """
+    corners = mesh.vertices.astype(np.float64)[mesh.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    size = np.linalg.norm(normals, axis=1)
+    area = size.cumsum()
+    chosen = np.searchsorted(area, (np.arange(count) + 0.5) / count * area[-1])
+    unit = normals[chosen] / np.maximum(size[chosen, None], 1e-12) * (NORMAL_M if outward else -NORMAL_M)
+    return np.hstack([corners[chosen].mean(axis=1), unit])
+
+
+def find_units(size: float) -> tuple[str, float]:
+    """The unit in which a subject of this size, the square root of its surface, is a person; and how far off it is.
+
+    Returns:
+        The unit, and the ratio of the size in it to that of a person, never below 1.
+    """
+    ratios = {unit: size * metres / SUBJECT_SIZE_M for unit, metres in UNITS.items()}
+    unit = min(ratios, key=lambda name: abs(np.log(max(ratios[name], 1e-12))))
+    return unit, float(np.exp(abs(np.log(max(ratios[unit], 1e-12)))))
+
+
+# --- without motion capture ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class MannequinFit:
+    """How well a mannequin explains a scan."""
+
+    misfit_m: float
+    """Mean distance, each point's at most `CLIP_M`."""
+    sole_m: float
+    """Where the mannequin stands, along the direction that was taken for up."""
+
+
+def find_up(probes: Sequence[Float[np.ndarray, "N 6"]]) -> dict[int, MannequinFit]:
+    """Fit the mannequin for each direction that may be up.
+
+    Args:
+        probes: points on scans, metres, with outward normals times `NORMAL_M`, in file axes.
+    Returns:
+        By axis 0, 1, 2 for x, y, z up and 3, 4, 5 for the same downwards: the mean over the probes.
+    """
+    fits = {}
+    for up in range(6):
+        turn = np.kron(np.eye(2), upright(up))
+        turned = [fit_mannequin(points @ turn.T) for points in probes]
+        fits[up] = MannequinFit(
+            float(np.mean([fit.misfit_m for fit in turned])), float(np.median([fit.sole_m for fit in turned]))
+        )
+    return fits
+
+
+def upright(up: int) -> Float64[np.ndarray, "3 3"]:
+    """The rotation by quarter turns that takes axis `up` (3 to 5: downwards) to Y."""
+    axis, sign = up % 3, -1.0 if up >= 3 else 1.0
+    if axis == 1:
+        return np.diag([1.0, sign, sign])
+    other = 2 - axis
+    rotation = np.zeros((3, 3))
+    rotation[1, axis] = sign
+    rotation[axis, 1] = -sign
+    rotation[other, other] = 1.0
+    return rotation
+
+
+def fit_mannequin(points: Float[np.ndarray, "N 6"]) -> MannequinFit:
+    """Stand a mannequin into oriented points by closest points: turn about the vertical, shift, and scale a little."""
+    figure, tree, top = _mannequin()
+    points = np.asarray(points, np.float64)
+    low, high = np.percentile(points[:, 1], (1, 99))
+    shifts = (top - high, -low, 1.15 - points[:, 1].mean())
+    best = MannequinFit(np.inf, 0.0)
+    for quarter, shift in itertools.product(range(6), shifts):
+        pose = _Pose(_about_y(quarter * np.pi / 6), 1.0, np.zeros(3))
+        centre = points[:, :3].mean(axis=0) * (1, 0, 1) - (0, shift, 0)
+        pose = _Pose(pose.rotation, 1.0, -pose.rotation @ centre)
+        for _ in range(8):
+            moved = pose.apply(points)
+            distance, nearest = tree.query(moved)
+            pose = _about_y_pose(points[:, :3], figure[nearest, :3], 1.0 / (1 + (distance / CLIP_M) ** 2) ** 2)
+        distance, _ = tree.query(pose.apply(points))
+        misfit = float(np.minimum(distance, CLIP_M).mean())
+        if misfit < best.misfit_m:
+            best = MannequinFit(misfit, float(-pose.shift[1] / pose.scale))
+    return best
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pose:
+    rotation: np.ndarray
+    scale: float
+    shift: np.ndarray
+
+    def apply(self, points: np.ndarray) -> np.ndarray:
+        moved = self.scale * points[:, :3] @ self.rotation.T + self.shift
+        return np.hstack([moved, points[:, 3:] @ self.rotation.T])
+
+
+def _about_y(angle: float) -> np.ndarray:
+    return np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+
+
+def _about_y_pose(points: np.ndarray, target: np.ndarray, weight: np.ndarray) -> _Pose:
+    """The turn about the vertical, scale and shift that bring points nearest to their targets."""
+    weight = weight / weight.sum()
+    here, there = weight @ points, weight @ target
+    a, b = points - here, target - there
+    cosine = float(weight @ (a[:, 0] * b[:, 0] + a[:, 2] * b[:, 2]))
+    sine = float(weight @ (a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2]))
+    rotation = _about_y(np.arctan2(sine, cosine))
+    scale = float(weight @ np.einsum("na,na->n", b, a @ rotation.T)) / max(float(weight @ (a * a).sum(axis=1)), 1e-12)
+    scale = float(np.clip(scale, *SCALE_RANGE))
+    return _Pose(rotation, scale, there - scale * rotation @ here)
+
+
+@lru_cache(maxsize=1)
+def _mannequin() -> tuple[np.ndarray, KDTree, float]:
+    """Points on a rough person 1.72 m tall facing +Z, feet on y = 0; proportions after Drillis and Contini (1966)."""
+    bones = [
+        ((0, 1.55, 0.01), (0, 1.63, 0.02), 0.08, 0.09),
+        ((0, 1.42, 0), (0, 1.54, 0), 0.06, 0.055),
+        ((-0.16, 1.39, 0), (0.16, 1.39, 0), 0.055, 0.055),
+        ((0, 0.95, 0), (0, 1.36, 0), 0.12, 0.12),
+    ]
+    for side in (-1.0, 1.0):
+        bones += [
+            ((side * 0.09, 0.95, 0), (side * 0.1, 1.33, 0), 0.11, 0.105),
+            ((side * 0.09, 0.88, 0), (side * 0.1, 0.48, 0), 0.085, 0.055),
+            ((side * 0.1, 0.48, 0), (side * 0.1, 0.08, 0), 0.055, 0.04),
+            ((side * 0.1, 0.04, -0.04), (side * 0.12, 0.035, 0.16), 0.035, 0.03),
+        ]
+        shoulder = np.array([side * 0.18, 1.39, 0])
+        for lateral, rise, forward in ((0.15, -1, 0.1), (0.7, -0.7, 0), (1, 0, 0), (0.4, 0.9, 0), (0.1, 0, 1)):
+            arm = np.array([side * lateral, rise, forward]) / np.linalg.norm((lateral, rise, forward))
+            bones.append((tuple(shoulder), tuple(shoulder + 0.68 * arm), 0.05, 0.03))
+    points = np.concatenate([_capsule(np.array(start), np.array(end), r, s) for start, end, r, s in bones])
+    return points, KDTree(points), float(points[:, 1].max())
+
+
+def _capsule(start: np.ndarray, end: np.ndarray, first: float, last: float) -> np.ndarray:
+    """Points some 25 mm apart on a cone with round ends, and their normals times `NORMAL_M`."""
+    axis = (end - start) / np.linalg.norm(end - start)
+    side = np.cross(axis, (0.3, 0.5, 0.81))
+    side /= np.linalg.norm(side)
+    other = np.cross(axis, side)
+    length = np.linalg.norm(end - start)
+    rings = []
+    for along in np.arange(-0.8 * first, length + 0.8 * last + 1e-9, 0.025):
+        share = np.clip(along / length, 0, 1)
+        radius = first + share * (last - first)
+        beyond = max(-along, along - length, 0.0)
+        radius = np.sqrt(max(radius**2 - beyond**2, 1e-4))
+        angle = np.arange(0, 2 * np.pi, 0.025 / max(radius, 0.02))
+        ring = np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * other
+        tip = np.sign(along - length / 2) * beyond
+        normal = radius * ring + tip * axis
+        normal *= NORMAL_M / np.linalg.norm(normal, axis=1, keepdims=True)
+        rings.append(np.hstack([start + along * axis + radius * ring, normal]))
+    return np.concatenate(rings)
+
+
+# --- with motion capture ------------------------------------------------------------------------------------------
+
+
+def fit_posed_bodies(
+    probes: Sequence[Float[np.ndarray, "N 3"]], bodies: Sequence[Float[np.ndarray, "verts 3"]]
+) -> list[tuple[float, Float64[np.ndarray, "3 3"]]]:
+    """Try every signed permutation of the axes against the posed bodies of the probes' frames.
+
+    Args:
+        probes: points on scans, metres, in file axes.
+        bodies: posed body surface of each.
+    Returns:
+        The misfit, metres, and the permutation, for all 48; the best first. A common shift of the take is let pass.
+    """
+    trees = [KDTree(np.asarray(body, np.float64)) for body in bodies]
+    fits = []
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            axes = np.zeros((3, 3))
+            axes[range(3), order] = signs
+            fits.append((_misfit([points @ axes.T for points in probes], bodies, trees), axes))
+    return sorted(fits, key=lambda fit: fit[0])
+
+
+def _misfit(probes: list[np.ndarray], bodies: Sequence[np.ndarray], trees: list[KDTree]) -> float:
+    starts = (np.zeros(3), np.mean([b.mean(axis=0) - p.mean(axis=0) for p, b in zip(probes, bodies, strict=True)], 0))
+    best = np.inf
+    for shift in starts:
+        for step in range(4):
+            misfits, moves = [], []
+            for points, body, tree in zip(probes, bodies, trees, strict=True):
+                distance, nearest = tree.query(points + shift, distance_upper_bound=0.5)
+                near = np.isfinite(distance)
+                misfits.append(np.minimum(distance, CLIP_M).mean())
+                if near.any():
+                    moves.append((body[np.asarray(nearest)[near]] - points[near] - shift).mean(axis=0))
+            best = min(best, float(np.mean(misfits)))
+            if step == 3 or not moves:
+                break
+            shift = shift + np.mean(moves, axis=0)
+    return best

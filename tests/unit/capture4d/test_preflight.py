@@ -1,0 +1,409 @@
+"""The preflight check on a figure of capsules: sound, and with one thing wrong at a time."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from capture4d.app.cli import main
+from capture4d.mesh_files import read_coloured_mesh, read_mesh, write_mesh
+from capture4d.preflight import ADVICE, CODES, BadFrame, TakeFacts, judge
+from capture4d.scan_placement import Placement, find_units, place, place_rig, upright
+from capture4d.scan_statistics import (
+    FrameStatistics,
+    Paints,
+    camera_counts,
+    hole_share,
+    measure_frame,
+    outwardness,
+    surface_noise,
+    surface_shift,
+    to_lab,
+)
+from capture4d.textures import texture_colours
+from capture4d.types import Mesh, Rig, Scan
+from capture4d.workdir import write_json
+
+BLUE, YELLOW, GREY = (47, 98, 201), (255, 196, 0), (150, 152, 156)
+PAINTS = Paints(BLUE, (YELLOW,))
+
+
+def sphere(radius: float = 1.0, subdivisions: int = 4) -> Mesh:
+    import trimesh
+
+    ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
+    return Mesh(np.asarray(ball.vertices, np.float32), np.asarray(ball.faces, np.int32))
+
+
+def figure(raised_deg: float) -> Scan:
+    """A person of capsules with one arm raised: blue trunk with a yellow band near its lower end, the rest grey."""
+    import trimesh
+
+    arm = np.radians(raised_deg - 70)
+    bones = [((0, 1.56, 0.01), (0, 1.62, 0.01), 0.09), ((0, 1.42, 0), (0, 1.5, 0), 0.055)]
+    bones += [((x, 0.98, 0), (x, 1.33, 0), 0.11) for x in (-0.08, 0.0, 0.08)]
+    for side in (-1, 1):
+        bones += [
+            ((side * 0.1, 0.88, 0), (side * 0.1, 0.06, 0), 0.06),
+            ((side * 0.1, 0.04, 0), (side * 0.1, 0.04, 0.16), 0.035),
+        ]
+        hand = (0.18 + 0.6 * np.cos(arm), 1.39 + 0.6 * np.sin(arm), 0) if side > 0 else (-0.4, 0.82, 0.05)
+        bones.append(((side * 0.18, 1.39, 0), hand, 0.04))
+    vertices, faces, colours, count = [], [], [], 0
+    for number, (start, end, radius) in enumerate(bones):
+        a, b = np.array(start), np.array(end)
+        limb = trimesh.creation.capsule(height=float(np.linalg.norm(b - a)), radius=radius, count=(12, 8))
+        limb = limb.subdivide_to_size(0.035)
+        limb.apply_transform(trimesh.geometry.align_vectors((0, 0, 1), (b - a) / np.linalg.norm(b - a)))
+        points = np.asarray(limb.vertices) + a
+        vertices.append(points)
+        faces.append(np.asarray(limb.faces) + count)
+        trunk = number in (2, 3, 4)
+        height = points[:, 1:2]
+        band = np.where(height < 0.94, GREY, np.where(height < 0.97, YELLOW, BLUE))
+        paint = band if trunk else np.tile(GREY, (len(points), 1))
+        colours.append(paint)
+        count += len(points)
+    mesh = Mesh(np.concatenate(vertices).astype(np.float32), np.concatenate(faces).astype(np.int32))
+    return Scan(mesh, np.concatenate(colours).astype(np.uint8), 0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def sound() -> dict[int, Scan]:
+    return {number: replace(figure(12.0 * number), frame_id=number) for number in range(10, 15)}
+
+
+def write(folder: Path, scans: dict[int, Scan], suffix: str = ".ply", **description: object) -> Path:
+    for number, scan in scans.items():
+        write_mesh(folder / "scans" / f"{number:06d}{suffix}", scan.mesh, colours=scan.colours)
+    told = {
+        "format": 1,
+        "name": "figure",
+        "fps": 30.0,
+        "garment_colour": "#2f62c9",
+        "boundary_colours": {"hem": "#ffc400"},
+    }
+    write_json(folder / "capture.json", {**told, **description})
+    return folder
+
+
+def moved(scans: dict[int, Scan], matrix: np.ndarray, shift: tuple[float, float, float] = (0, 0, 0)) -> dict[int, Scan]:
+    change = lambda mesh: mesh.with_vertices((mesh.vertices @ matrix.T + shift).astype(np.float32))  # noqa: E731
+    return {number: replace(scan, mesh=change(scan.mesh)) for number, scan in scans.items()}
+
+
+def check(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> tuple[int, dict]:
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as exit_:
+        main(["check", *map(str, arguments), "--json", "--workers", "1"])
+    return int(exit_.value.code or 0), json.loads(capsys.readouterr().out)
+
+
+def codes(found: dict) -> list[str]:
+    return [finding["code"] for finding in found["findings"]]
+
+
+# --- measures, against what is known exactly
+
+
+def test_a_sphere_looks_outwards_and_inside_out_inwards():
+    ball = sphere()
+    assert outwardness(ball) == pytest.approx(1.0, abs=0.01)
+    assert outwardness(Mesh(ball.vertices, ball.faces[:, ::-1].copy())) == pytest.approx(-1.0, abs=0.01)
+
+
+def test_noise_is_that_of_the_plane_whatever_its_scale():
+    rng = np.random.default_rng(0)
+    x, y = np.meshgrid(np.arange(40.0), np.arange(40.0))
+    flat = np.stack([x.ravel(), y.ravel(), np.zeros(1600)], 1)
+    index = np.arange(1600).reshape(40, 40)
+    a, b, c = index[:-1, :-1].ravel(), index[:-1, 1:].ravel(), index[1:, :-1].ravel()
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([b, b + 40, c], 1)]).astype(np.int32)
+    rough = flat + (0, 0, 0.3) * rng.standard_normal((1600, 1))
+    assert surface_noise(Mesh(flat.astype(np.float32), faces)) < 1e-3
+    levels = [surface_noise(Mesh((scale * rough).astype(np.float32), faces)) for scale in (0.001, 1.0)]
+    assert levels[0] == pytest.approx(levels[1], rel=1e-3)
+    assert levels[0] > 0.12
+
+
+def test_a_hole_counts_with_its_area():
+    ball = sphere(0.3)
+    assert hole_share(ball) == 0.0
+    open_ball = Mesh(ball.vertices, ball.faces[~(ball.vertices[ball.faces][:, :, 1] > 0.29).any(axis=1)])
+    cap = 2 * np.pi * 0.3 * 0.01
+    assert hole_share(open_ball) == pytest.approx(cap / (4 * np.pi * 0.09), rel=0.3)
+
+
+def test_a_shift_is_measured_across_the_surface():
+    ball = sphere(0.3)
+    assert surface_shift(ball, ball) == pytest.approx(0.0, abs=1e-6)
+    grown = ball.with_vertices(ball.vertices * np.float32(1.02))
+    assert surface_shift(ball, grown) == pytest.approx(0.006, rel=0.05)
+
+
+def test_cameras_count_what_lies_in_their_images():
+    T = np.eye(4)
+    rig = Rig(
+        ("a",),
+        np.array([[[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]]),
+        np.zeros((1, 5)),
+        T[None],
+        np.array([[101, 101]], np.int32),
+    )
+    points = np.array([[0.0, 0, 1], [0.49, 0, 1], [0.6, 0, 1], [0, 0, -1]])
+    np.testing.assert_array_equal(camera_counts(rig, points), [1, 1, 0, 0])
+
+
+def test_a_rig_moves_with_its_scans():
+    rng = np.random.default_rng(1)
+    T = np.eye(4)
+    T[:3, 3] = 0.1, -0.2, 2.0
+    rig = Rig(("a",), np.eye(3)[None], np.zeros((1, 5)), T[None], np.array([[9, 9]], np.int32))
+    placement = Placement(0.01, upright(2), lift_m=0.4)
+    points = rng.random((5, 3))
+    placed = 0.01 * points @ placement.axes.T + (0, 0.4, 0)
+    there = place_rig(rig, placement, scale=0.01).T_camera_world[0]
+    np.testing.assert_allclose(
+        placed @ there[:3, :3].T + there[:3, 3], 0.01 * (points @ T[:3, :3].T + T[:3, 3]), atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("up", range(6))
+def test_upright_is_a_rotation_that_takes_the_axis_to_y(up: int):
+    direction = np.eye(3)[up % 3] * (-1 if up > 2 else 1)
+    np.testing.assert_array_equal(upright(up) @ direction, (0, 1, 0))
+    assert np.linalg.det(upright(up)) == pytest.approx(1)
+
+
+@pytest.mark.parametrize(("unit", "metres"), [("m", 1.0), ("cm", 0.01), ("mm", 0.001), ("in", 0.0254)])
+@pytest.mark.parametrize("size_m", [0.95, 1.5])
+def test_units_of_shirts_and_of_whole_people(unit: str, metres: float, size_m: float):
+    assert find_units(size_m / metres)[0] == unit
+
+
+def test_placing_a_mirrored_mesh_back_makes_it_look_outwards():
+    ball = sphere()
+    mirror = np.diag([-1.0, 1, 1])
+    mirrored = ball.with_vertices((ball.vertices @ mirror.T).astype(np.float32))
+    assert outwardness(place(mirrored, Placement(axes=mirror))) == pytest.approx(1, abs=0.01)
+
+
+def test_lab_of_the_primaries():
+    expected = [[53.24, 80.09, 67.20], [87.73, -86.18, 83.18], [100.0, 0, 0]]  # CIE, sRGB red, green, white under D65
+    found = to_lab(np.array([[255, 0, 0], [0, 255, 0], [255, 255, 255]], np.uint8))
+    np.testing.assert_allclose(found, expected, atol=0.05)
+
+
+# --- textures
+
+
+def test_a_texture_of_a_ramp_gives_the_ramp_at_the_vertices(tmp_path: Path):
+    from PIL import Image
+
+    ramp = np.zeros((2, 256, 3), np.uint8)
+    ramp[:, :, 0] = np.arange(256)
+    ramp[0, :, 1] = 200
+    u = (np.array([10, 200, 100]) + 0.5) / 256
+    mesh = Mesh(
+        np.eye(3, dtype=np.float32),
+        np.array([[0, 1, 2]], np.int32),
+        np.stack([u, [0.9, 0.1, 0.9]], 1)[None].astype(np.float32),
+    )
+    expected = [[10, 200, 0], [200, 0, 0], [100, 200, 0]]
+    np.testing.assert_array_equal(texture_colours(mesh, ramp), expected)
+    write_mesh(tmp_path / "scan.obj", mesh)
+    Image.fromarray(ramp).save(tmp_path / "skin.png")
+    (tmp_path / "scan.mtl").write_text("newmtl skin\nmap_Kd skin.png\n")
+    text = (tmp_path / "scan.obj").read_text()
+    (tmp_path / "scan.obj").write_text(f"mtllib scan.mtl\n{text}")
+    np.testing.assert_array_equal(read_coloured_mesh(tmp_path / "scan.obj").colours, expected)
+
+
+# --- judgement
+
+
+def frame(number: int, **changes: object) -> FrameStatistics:
+    base = measure_frame(replace(figure(0), frame_id=number), PAINTS) if not FRAME else FRAME[0]
+    FRAME[:] = [base]
+    return replace(base, frame_id=number, content=str(number), **changes)  # type: ignore[arg-type]
+
+
+FRAME: list[FrameStatistics] = []
+
+
+def judged(
+    frames: list[FrameStatistics], bad: tuple[BadFrame, ...] = (), **facts: object
+) -> list[tuple[str, tuple[int, ...]]]:
+    told = TakeFacts(fps=30.0, declared=1.0, paints=PAINTS, frame_ids=tuple(f.frame_id for f in frames))
+    verdict = judge(replace(told, **facts), None, frames, bad)  # type: ignore[arg-type]
+    return [(finding.code, finding.frames) for finding in verdict.findings]
+
+
+def test_every_code_has_advice():
+    assert set(ADVICE) == set(CODES)
+
+
+def test_sound_frames_are_judged_sound_at_any_regular_step():
+    assert judged([frame(number) for number in range(7, 60, 5)]) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "code"),
+    [
+        ({"noise": 0.3}, "noise"),
+        ({"hole_share": 0.5}, "holes"),
+        ({"area_m2": 0.8}, "frame-partial"),
+        ({"content": "1"}, "frame-repeated"),
+        ({"colours": None}, "colours-missing"),
+        ({"pose_distance_m": 0.08}, "poses-mismatch"),
+    ],
+)
+def test_one_bad_frame_is_named(changes: dict, code: str):
+    frames = [frame(number) for number in range(1, 9)]
+    frames[4] = replace(frames[4], **changes)
+    assert judged(frames) == [(code, (5,))]
+
+
+def test_a_scaled_frame_is_named_and_a_cropped_one_is_not_scaled():
+    frames = [frame(number) for number in range(1, 9)]
+    frames[2] = replace(frames[2], area_m2=frames[2].area_m2 * 1.21, spacing_m=frames[2].spacing_m * 1.1)
+    frames[5] = replace(frames[5], area_m2=frames[5].area_m2 * 0.8)
+    assert judged(frames) == [("scale-jump", (3,))]
+
+
+def test_numbers_tell_what_is_missing():
+    frames = [frame(number) for number in (2, 4, 6, 10, 12)]
+    assert judged(frames) == [("frames-missing", (8,))]
+    assert judged(frames, dropped=(8,)) == []
+    assert judged(frames, dropped=(8,), listed=(2, 3)) == [("frames-missing", (3,))]
+    assert judged(frames, dropped=(8,), duplicated=(4,)) == [("frames-duplicated", (4,))]
+    assert judged(frames, dropped=(8,), pose_frames=(2, 4, 6, 10)) == [("poses-missing", (12,))]
+
+
+@pytest.mark.parametrize(("fps", "shift", "wrong"), [(30, 0.02, False), (30, 0.15, True), (0.03, 0.02, True)])
+def test_speed_tells_the_rate(fps: float, shift: float, wrong: bool):
+    frames = [frame(number, shift_m=shift, shift_from=number - 1) for number in range(1, 9)]
+    assert judged(frames, fps=float(fps)) == ([("fps", ())] if wrong else [])
+
+
+def test_time_stamps_and_motion_capture_tell_the_rate():
+    frames = [frame(number, time_s=number / 60) for number in range(1, 9)]
+    assert judged(frames) == [("fps", ())]
+    assert judged(frames, fps=60.0) == []
+    assert judged([frame(number) for number in range(1, 9)], pose_fps=60.0) == [("fps", ())]
+
+
+# --- the command
+
+
+def test_a_sound_take_is_clean(sound: dict[int, Scan], tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    code, found = check(capsys, write(tmp_path / "take", sound))
+    assert (code, found["status"], found["findings"]) == (0, "clean", [])
+    assert set(found) == {"format", "capture", "status", "frames", "frames_checked", "findings", "scores", "fixed"}
+    assert set(found["scores"]) <= set(CODES)
+    assert all(0 <= score <= 1 for score in found["scores"].values())
+
+
+def test_warnings_are_exit_code_1(sound: dict[int, Scan], tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    take = write(tmp_path / "take", {number: scan for number, scan in sound.items() if number != 12})
+    code, found = check(capsys, take)
+    assert (code, codes(found), found["findings"][0]["frames"]) == (1, ["frames-missing"], [12])
+
+
+TURN = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+
+
+@pytest.mark.parametrize(
+    ("matrix", "shift", "wrong"),
+    [
+        (1000 * np.eye(3), (0, 0, 0), "units"),
+        (TURN, (0, 0, 0), "axes"),
+        (np.diag([-1.0, 1, 1]), (0, 0, 0), "winding"),
+        (np.eye(3), (0, 0.4, 0), "floor"),
+    ],
+)
+def test_a_fixed_take_is_clean_and_the_original_untouched(
+    matrix: np.ndarray,
+    shift: tuple[float, float, float],
+    wrong: str,
+    sound: dict[int, Scan],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+):
+    take = write(tmp_path / "take", moved(sound, matrix, shift))
+    digest = lambda: {p: hashlib.sha256(p.read_bytes()).digest() for p in sorted(take.rglob("*.*"))}  # noqa: E731
+    before = digest()
+    code, found = check(capsys, take, "--fix")
+    assert codes(found) == [wrong]
+    assert code == (1 if wrong == "floor" else 2)
+    assert found["fixed"] == str(tmp_path / "take-fixed")
+    assert digest() == before
+    assert check(capsys, tmp_path / "take-fixed")[1]["findings"] == []
+    if wrong != "winding":
+        fixed = read_mesh(tmp_path / "take-fixed" / "scans" / "000011.ply").mesh
+        # The floor is known to a few centimetres; everything else exactly.
+        np.testing.assert_allclose(fixed.vertices, sound[11].mesh.vertices, atol=0.04 if wrong == "floor" else 1e-4)
+
+
+def test_unusable_frames_are_left_out(sound: dict[int, Scan], tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    take = write(tmp_path / "take", sound)
+    whole = (take / "scans" / "000011.ply").read_bytes()
+    (take / "scans" / "000011.ply").write_bytes(whole[: len(whole) // 2])
+    (take / "scans" / "000013.ply").write_bytes(b"")
+    code, found = check(capsys, take, "--fix")
+    assert (code, codes(found)) == (2, ["frame-unreadable", "frame-empty"])
+    description = json.loads((tmp_path / "take-fixed" / "capture.json").read_text())
+    assert description["frames"] == [10, 12, 14]
+    assert description["dropped_frames"] == [11, 13]
+    assert check(capsys, tmp_path / "take-fixed")[0] == 0
+
+
+def test_a_folder_of_scans_is_enough(sound: dict[int, Scan], tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    for number, scan in sound.items():
+        write_mesh(tmp_path / f"take_{number}_v2.ply", scan.mesh, colours=scan.colours)
+    code, found = check(capsys, tmp_path, "--frames", "take_{frame}_v2.ply", "--garment-colour", "#2f62c9")
+    assert (code, found["frames"]) == (0, 5)
+
+
+@pytest.mark.parametrize(
+    ("options", "text", "said"),
+    [
+        (["--frames", "scan.ply"], None, "expected a file name with {frame} in it once"),
+        (["--frames", "other_{frame}.ply"], None, "expected scans named other_{frame}.ply, found none"),
+        ([], "{", "not valid JSON"),
+        ([], "[]", "expected a JSON object"),
+        ([], '{"fps": -1}', "expected a positive frame rate"),
+        ([], '{"units": "furlong"}', "expected one of m, cm, mm, in"),
+        ([], '{"garment_colour": "blue"}', "expected a colour such as"),
+    ],
+)
+def test_bad_input_is_one_line(
+    options: list[str],
+    text: str | None,
+    said: str,
+    sound: dict[int, Scan],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+):
+    take = write(tmp_path / "take", {10: sound[10]})
+    if text is not None:
+        (take / "capture.json").write_text(text)
+    with pytest.raises(SystemExit) as exit_:
+        main(["check", str(take), *options])
+    err = capsys.readouterr().err
+    assert exit_.value.code == 1
+    assert said in err
+    assert err.count("\n") == 1
+
+
+def test_nothing_there_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    for folder, said in ((tmp_path / "none", "found nothing"), (tmp_path, "found none")):
+        with pytest.raises(SystemExit) as exit_:
+            main(["check", str(folder)])
+        assert exit_.value.code == 1
+        assert said in capsys.readouterr().err
