@@ -13,7 +13,6 @@ Peers start where ours starts and are timed in the same way: process time, all t
 
 from __future__ import annotations
 
-import resource
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -27,6 +26,7 @@ import numpy as np
 from rich.console import Console
 from scipy.spatial import KDTree
 
+from benchmarks.memory import peak_rss_mb
 from benchmarks.metric import Metric
 from benchmarks.peers import PEERS, run_peer
 from capture4d.evaluation import (
@@ -308,7 +308,7 @@ def _register_and_measure(capture: Path, garment: Path | None, output: Path) -> 
         extract(capture, garment)
         output = output / "registration"
     register(capture, garment, output, RegistrationConfig(), workers=1)
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return peak_rss_mb()
 
 
 def _first_frames(capture: Capture, folder: Path, count: int) -> Path:

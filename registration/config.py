@@ -135,8 +135,10 @@ class DenseConfig:
     """After a warm coarse stage."""
     plasticity: float = 0.5
     """Share of the bending that is forgiven between steps: 0 keeps the coarse stage's shape, 1 only damps change."""
-    compression: float = 0.5
+    compression: float = 1.0
     """Share of the stretch weight that resists shortening: folds finer than the template's edges shorten them."""
+    fold_lengths: bool = True
+    """Hold edges to the length that the folds in the scan leave them, instead of their length on the pattern."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +152,7 @@ class SequenceConfig:
     """A keyframe's joints are at most this far from the rest pose, root mean square, degrees; 0 makes one segment."""
     start: Literal["best", "previous", "skinned"] = "best"
     """Start of a frame: the frame before, the skinned pose, or whichever is nearer to the scan."""
-    carry: float = 0.97
+    carry: float = 0.9
     """Share of the offsets from the skinned pose that a frame hands to the next, in the rest pose."""
     cold_above: float = 0.004
     """Take the cold schedule when the median distance from start to scan exceeds this, metres."""
@@ -227,6 +229,8 @@ SOFT = RegistrationConfig(
     dense=DenseConfig(
         cold=Schedule(40, (0.12, 0.06), smooth=(30.0, 0.05)),
         plasticity=0.0,
+        compression=0.5,
+        fold_lengths=False,
     ),
 )
 

@@ -18,6 +18,7 @@ from registration.config import BoundaryRule, RegistrationConfig, Schedule
 from registration.correspondences import ScanSurface, match, match_both_ways, mesh_normals, prepare_scan
 from registration.deformation_graph import identity_nodes, node_edge_rows, rows_of_vertices, smooth_rows
 from registration.energies import edge_vectors, plane_metric, rigid_term, stretch_metric, tangential_metric
+from registration.fold_lengths import folded_lengths
 from registration.solver import Rows, RowTerm, gauss_newton_step
 from registration.template import TemplateAnalysis
 
@@ -166,6 +167,11 @@ def _dense_stage(
         np.ones((len(analysis.border.vertices), 1)),
     )
     reference = analysis.laplacian_rows.apply(vertices[:, :, None])
+    lengths = analysis.rest_lengths
+    if schedule.steps and config.dense.fold_lengths:
+        lengths = folded_lengths(
+            scan.surface, vertices, analysis.faces, analysis.edges, analysis.edge_faces, analysis.rest_lengths
+        )
     for step in range(schedule.steps):
         at = (step, schedule.steps)
         normals = mesh_normals(vertices, analysis.faces)
@@ -176,7 +182,7 @@ def _dense_stage(
             anneal(schedule.boundary, *at), config,
         )  # fmt: skip
         stretch, excess = stretch_metric(
-            edge_vectors(vertices, analysis.edges), analysis.rest_lengths,
+            edge_vectors(vertices, analysis.edges), lengths,
             weight=anneal(schedule.stretch, *at), compression=config.dense.compression,
         )  # fmt: skip
         terms.append(RowTerm(analysis.edge_rows, stretch, excess))

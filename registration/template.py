@@ -12,6 +12,7 @@ from capture4d.mesh import unique_edges
 from capture4d.types import Garment, Mesh
 from registration.config import RegistrationConfig
 from registration.deformation_graph import DeformationGraph, build_graph
+from registration.fold_lengths import edge_faces
 from registration.solver import Rows
 
 __all__ = ["Border", "TemplateAnalysis", "analyse_template"]
@@ -47,6 +48,8 @@ class TemplateAnalysis:
     faces: Int32[np.ndarray, "faces 3"]
     rest: Float64[np.ndarray, "verts 3"]
     edges: Int32[np.ndarray, "edges 2"]
+    edge_faces: Int32[np.ndarray, "edges 2"]
+    """The faces on both sides of each edge; on the border the one face twice."""
     rest_lengths: Float64[np.ndarray, " edges"]
     graph: DeformationGraph
     coarse_vertices: Int32[np.ndarray, " subset"]
@@ -83,6 +86,7 @@ def analyse_template(garment: Garment, config: RegistrationConfig) -> TemplateAn
         faces=faces,
         rest=rest,
         edges=edges,
+        edge_faces=edge_faces(faces, edges),
         rest_lengths=lengths,
         graph=graph,
         coarse_vertices=_coarse_vertices(len(rest), config.graph.vertices, border, faces),

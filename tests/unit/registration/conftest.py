@@ -79,5 +79,5 @@ def exact() -> RegistrationConfig:
         boundary=BoundaryConfig(coarse_rule="nearest", dense_rule="nearest"),
         graph=GraphConfig(nodes=40, vertices=0),
         coarse=CoarseConfig(cold=steps),
-        dense=DenseConfig(cold=dense),
+        dense=DenseConfig(cold=dense, fold_lengths=False),
     )
