@@ -307,13 +307,13 @@ def _print_rows(rows: list[_Row]) -> None:
     Console().print(table)
 
 
-# ru_maxrss will not do: it outlives exec, so that a child starts from its parent's peak.
 PEAK_SCRIPT = """
-import re, sys
+import sys
 from pathlib import Path
+from benchmarks.memory import peak_rss_mb
 from capture4d.app.check import check_take
 check_take(Path(sys.argv[1]), all_frames=True)
-print(int(re.search("VmHWM:[^0-9]+([0-9]+)", Path("/proc/self/status").read_text())[1]) / 1024)
+print(peak_rss_mb())
 """
 
 

@@ -6,6 +6,7 @@ import hashlib
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -93,7 +94,9 @@ def write(folder: Path, scans: dict[int, Scan], suffix: str = ".ply", **descript
 
 
 def moved(scans: dict[int, Scan], matrix: np.ndarray, shift: tuple[float, float, float] = (0, 0, 0)) -> dict[int, Scan]:
-    change = lambda mesh: mesh.with_vertices((mesh.vertices @ matrix.T + shift).astype(np.float32))  # noqa: E731
+    def change(mesh: Mesh) -> Mesh:
+        return mesh.with_vertices((mesh.vertices @ matrix.T + shift).astype(np.float32))
+
     return {number: replace(scan, mesh=change(scan.mesh)) for number, scan in scans.items()}
 
 
@@ -227,20 +230,20 @@ def test_a_texture_of_a_ramp_gives_the_ramp_at_the_vertices(tmp_path: Path):
 # --- judgement
 
 
-def frame(number: int, **changes: object) -> FrameStatistics:
+def frame(number: int, **changes: Any) -> FrameStatistics:
     base = measure_frame(replace(figure(0), frame_id=number), PAINTS) if not FRAME else FRAME[0]
     FRAME[:] = [base]
-    return replace(base, frame_id=number, content=str(number), **changes)  # type: ignore[arg-type]
+    return replace(base, frame_id=number, content=str(number), **changes)
 
 
 FRAME: list[FrameStatistics] = []
 
 
 def judged(
-    frames: list[FrameStatistics], bad: tuple[BadFrame, ...] = (), **facts: object
+    frames: list[FrameStatistics], bad: tuple[BadFrame, ...] = (), **facts: Any
 ) -> list[tuple[str, tuple[int, ...]]]:
     told = TakeFacts(fps=30.0, declared=1.0, paints=PAINTS, frame_ids=tuple(f.frame_id for f in frames))
-    verdict = judge(replace(told, **facts), None, frames, bad)  # type: ignore[arg-type]
+    verdict = judge(replace(told, **facts), None, frames, bad)
     return [(finding.code, finding.frames) for finding in verdict.findings]
 
 
@@ -336,7 +339,10 @@ def test_a_fixed_take_is_clean_and_the_original_untouched(
     capsys: pytest.CaptureFixture[str],
 ):
     take = write(tmp_path / "take", moved(sound, matrix, shift))
-    digest = lambda: {p: hashlib.sha256(p.read_bytes()).digest() for p in sorted(take.rglob("*.*"))}  # noqa: E731
+
+    def digest() -> dict[Path, bytes]:
+        return {p: hashlib.sha256(p.read_bytes()).digest() for p in sorted(take.rglob("*.*"))}
+
     before = digest()
     code, found = check(capsys, take, "--fix")
     assert codes(found) == [wrong]
