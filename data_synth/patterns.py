@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
+from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.optimize import root_scalar
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -24,10 +25,11 @@ from capture4d.body import ShapedBody
 from capture4d.mesh import boundary_loops
 from data_synth.config import GarmentStyle
 
-__all__ = ["PanelMesh", "Pattern", "locate", "mesh_pattern", "tshirt_pattern"]
+__all__ = ["PanelMesh", "Pattern", "locate", "mesh_pattern", "smooth_noise", "tshirt_pattern"]
 
 LAYOUT_GAP_M = 0.05
 """Free space between panels of the plane domain."""
+NOISE_PIXEL_M = 0.003
 
 
 @dataclass(frozen=True, slots=True)
@@ -353,3 +355,21 @@ def locate(mesh: PanelMesh, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     best = np.argmax(barycentric.min(axis=-1), axis=1)
     rows = np.arange(len(uv))
     return candidates[rows, best].astype(np.int32), barycentric[rows, best]
+
+
+def smooth_noise(
+    uv: np.ndarray, amplitude_m: float, width_m: tuple[float, float], rng: np.random.Generator
+) -> np.ndarray:
+    """Gaussian noise on the plane domain at some of its points, (N,) float32 metres.
+
+    Args:
+        uv: (N, 2) metres.
+        amplitude_m: standard deviation.
+        width_m: of the bumps, across and along the grain. Cloth folds along its grain under its own weight; noise that
+            is as short along as across gives lumps.
+    """
+    low, high = uv.min(axis=0) - NOISE_PIXEL_M, uv.max(axis=0) + NOISE_PIXEL_M
+    shape = np.ceil((high - low) / NOISE_PIXEL_M).astype(int) + 1
+    noise = gaussian_filter(rng.standard_normal(shape), np.array(width_m) / NOISE_PIXEL_M, mode="wrap")
+    values = map_coordinates(noise / noise.std(), ((uv - low) / NOISE_PIXEL_M).T, order=1)
+    return (amplitude_m * values).astype(np.float32)

@@ -19,11 +19,12 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation, Slerp
 
 from capture4d.body import PosedBody, ShapedBody, skin, unskin, with_pose
+from capture4d.mesh import vertex_normals
 from capture4d.open3d_loading import import_open3d
 from capture4d.types import PoseSequence
 from capture4d.warp_loading import import_warp
 from data_synth.config import Fabric, SimulationConfig
-from data_synth.patterns import PanelMesh, Pattern
+from data_synth.patterns import PanelMesh, Pattern, smooth_noise
 from data_synth.template import bind
 
 __all__ = ["approach_poses", "dress", "simulate"]
@@ -188,7 +189,8 @@ class _Hold:
 
     They stand for what keeps a worn shirt in place, the seams and the stiffness of the yoke, and they are why a take
     depends on the pose and hardly on how it was reached: where friction lets the cloth stick, and where it buckles
-    when the arms go up, a free sheet has as many answers as histories.
+    when the arms go up, a free sheet has as many answers as histories. The places are bumpy, always in the same way,
+    and so decide how the cloth buckles.
     """
 
     rest: np.ndarray
@@ -206,9 +208,11 @@ class _Hold:
         _, _, weights = bind(mesh, cloth, body)
         rest, flagged = unskin(cloth, weights, body.transforms)
         assert not flagged.any(), "the dressing pose cannot be unposed"
+        bumps = smooth_noise(mesh.vertex_uv, config.hold_ripple_m, config.hold_ripple_width_m, np.random.default_rng(1))
         shoulder = body.shaped.joints[body.shaped.body.joint_names.index("upperarm01.L")]
         below = np.maximum(shoulder[1] - rest[:, 1], 0) / config.hold_depth_m
         share = config.hold_floor + (1 - config.hold_floor) * np.exp(-(below**2))
+        rest = rest + bumps[:, None] * vertex_normals(rest, mesh.faces)
         return _Hold(rest, weights, ((2 * np.pi * config.hold_hz) ** 2 * share * masses)[:, None])
 
     def places(self, body: PosedBody) -> np.ndarray:

@@ -18,16 +18,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from scipy.ndimage import gaussian_filter, map_coordinates
 
 from capture4d.mesh import unique_edges, vertex_adjacency, vertex_normals
 from capture4d.open3d_loading import import_open3d
 from data_synth.config import Fabric, RelaxationConfig
-from data_synth.patterns import PanelMesh, locate
+from data_synth.patterns import PanelMesh, locate, smooth_noise
 
 __all__ = ["BodyPlanes", "WrinkleMesh", "body_planes", "relax_frame", "wrinkle_mesh"]
-
-IMPERFECTION_PIXEL_M = 0.003
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,7 +84,7 @@ def wrinkle_mesh(coarse: PanelMesh, fine: PanelMesh, config: RelaxationConfig, r
         rest_lengths=rest_lengths.astype(np.float32),
         hinges=hinges.astype(np.int32),
         hinge_weights=weights.astype(np.float32),
-        imperfection=_imperfection(fine.vertex_uv, config, rng),
+        imperfection=smooth_noise(fine.vertex_uv, config.imperfection_m, config.imperfection_width_m, rng),
     )
 
 
@@ -148,19 +145,6 @@ def _hinges(mesh: PanelMesh) -> tuple[np.ndarray, np.ndarray]:
         axis=1,
     )
     return hinges, np.column_stack([weights, 1 / (weights**2).sum(axis=1)])
-
-
-def _imperfection(plane: np.ndarray, config: RelaxationConfig, rng: np.random.Generator) -> np.ndarray:
-    """Smooth noise on the pattern, longer along the grain than across, (V,) float32 metres.
-
-    Cloth folds along its grain under its own weight; noise that is as short along as across gives lumps.
-    """
-    low, high = plane.min(axis=0) - IMPERFECTION_PIXEL_M, plane.max(axis=0) + IMPERFECTION_PIXEL_M
-    shape = np.ceil((high - low) / IMPERFECTION_PIXEL_M).astype(int) + 1
-    widths = np.array(config.imperfection_width_m) / IMPERFECTION_PIXEL_M
-    noise = gaussian_filter(rng.standard_normal(shape), widths, mode="wrap")
-    values = map_coordinates(noise / noise.std(), ((plane - low) / IMPERFECTION_PIXEL_M).T, order=1)
-    return (config.imperfection_m * values).astype(np.float32)
 
 
 def lift(mesh: WrinkleMesh, coarse: np.ndarray, smoothing: float = 0.6) -> tuple[np.ndarray, np.ndarray]:
