@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-__all__ = ["face_components", "laplacian_pass", "open_vertices", "vertex_normals_kernel"]
+__all__ = ["face_components", "laplacian_pass", "mean_edge_length", "open_vertices", "vertex_normals_kernel"]
 
 
 @njit(cache=True)
@@ -29,6 +29,19 @@ def open_vertices(faces, count):
             b = np.int64(back) * np.int64(2654435761)
             balance[vertex] += (a ^ (a >> 17)) - (b ^ (b >> 17))
     return balance != 0, used
+
+
+@njit(cache=True)
+def mean_edge_length(positions, faces):
+    """Mean length of one side of each face."""
+    total = 0.0
+    for f in range(len(faces)):
+        a, b = faces[f, 0], faces[f, 1]
+        square = 0.0
+        for axis in range(3):
+            square += (positions[b, axis] - positions[a, axis]) ** 2
+        total += np.sqrt(square)
+    return total / max(len(faces), 1)
 
 
 @njit(cache=True)

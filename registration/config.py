@@ -138,7 +138,8 @@ class DenseConfig:
     compression: float = 1.0
     """Share of the stretch weight that resists shortening: folds finer than the template's edges shorten them."""
     fold_lengths: bool = True
-    """Hold edges to the length that the folds in the scan leave them, instead of their length on the pattern."""
+    """In the warm schedule, hold edges to the length that the folds in the scan leave them, instead of their length on
+    the pattern. From a distant start the folds seen around an edge are not yet its own."""
 
 
 @dataclass(frozen=True, slots=True)

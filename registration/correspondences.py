@@ -1,4 +1,4 @@
-"""What the template is matched to: the scan's surface, smoothed once, with normals and a search tree.
+"""What the template is matched to: the scan's surface, smoothed once, with normals and its points sorted for searching.
 
 A template vertex is matched to its nearest scan vertex and measured against the plane there. With 2-3 mm between scan
 vertices that is as good as the closest point of the triangles and half the time; matches on the rims of holes are kept,
@@ -14,13 +14,16 @@ from jaxtyping import Bool, Float, Float64, Int, Integer
 from scipy import sparse
 from scipy.spatial import KDTree
 
-from capture4d.mesh_kernels import laplacian_pass, open_vertices, vertex_normals_kernel
+from capture4d.mesh_kernels import laplacian_pass, mean_edge_length, open_vertices, vertex_normals_kernel
+from registration.point_grid import PointGrid
 
 __all__ = ["Matches", "ScanSurface", "match", "match_both_ways", "mesh_normals", "prepare_scan"]
 
 
-SECOND_LAYER = 12
-"""How many scan vertices are looked through for one on the right layer."""
+SECOND_LAYER = 2.0
+"""A vertex whose nearest scan vertex looks another way may take one so many scan spacings beside it that does not."""
+CELL_SPACINGS = 3.0
+"""Edge of a search cell in scan spacings: some nine points in each cell that the surface passes through."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,7 +36,7 @@ class ScanSurface:
     """Unit normals."""
     rim: Bool[np.ndarray, " points"]
     """True on open edges: borders and the rims of holes."""
-    tree: KDTree
+    grid: PointGrid
     spacing: float
     """Mean edge length, metres: what the scan resolves."""
 
@@ -55,7 +58,7 @@ class Matches:
 def prepare_scan(
     vertices: Float[np.ndarray, "points 3"], faces: Integer[np.ndarray, "faces 3"], *, smoothing_passes: int
 ) -> ScanSurface:
-    """Smooth the scan, take normals and build the search tree; vertices without faces are dropped.
+    """Smooth the scan, take normals and sort the points for searching; vertices without faces are dropped.
 
     Args:
         smoothing_passes: Laplacian passes at half step; open edges stay where they are, so that nothing shrinks.
@@ -66,12 +69,11 @@ def prepare_scan(
     for _ in range(smoothing_passes):
         positions = laplacian_pass(positions, triangles, rim)
     normals = vertex_normals_kernel(positions, triangles)
-    edge = positions[triangles[:, 0]] - positions[triangles[:, 1]]
-    spacing = float(np.sqrt((edge * edge).sum(axis=1)).mean())
+    spacing = float(mean_edge_length(positions, triangles))
     if not used.all():
         positions, normals, rim = positions[used], normals[used], rim[used]
-    tree = KDTree(positions, balanced_tree=False, compact_nodes=False)
-    return ScanSurface(positions, normals, rim, tree, spacing)
+    grid = PointGrid.build(positions, CELL_SPACINGS * spacing)
+    return ScanSurface(positions, normals, rim, grid, spacing)
 
 
 def mesh_normals(
@@ -92,30 +94,26 @@ def match(
 ) -> Matches:
     """Nearest scan vertex of each point, gated in distance and normal, with Geman-McClure weights.
 
-    A point whose nearest scan vertex looks another way, as on two layers of cloth, takes the nearest of the next few
-    that does not.
+    A point whose nearest scan vertex looks another way, as on two layers of cloth, takes the nearest that does not, if
+    there is one close beside it.
 
     Args:
         gate: largest distance, metres.
         robust_scale: scale of the weight (1 + (d/s)^2)^-2 as a share of the gate, d measured along the scan's normal.
     """
-    distances, indices = surface.tree.query(points, distance_upper_bound=gate)
+    distances, indices = surface.grid.query(points, gate)
     found = indices < len(surface.points)
     nearest = np.where(found, indices, 0)
     cosine = np.einsum("va,va->v", normals, surface.normals[nearest])
     turned = np.flatnonzero(found & (cosine < min_normal_cosine))
-    if len(turned):
-        further, others = surface.tree.query(points[turned], k=SECOND_LAYER, distance_upper_bound=gate)
-        there = np.isfinite(further)
-        others = np.where(there, others, 0)
-        other_cosine = np.einsum("va,vka->vk", normals[turned], surface.normals[others])
-        fits = there & (other_cosine >= min_normal_cosine)
-        first, rows = np.argmax(fits, axis=1), np.arange(len(turned))
-        better = fits.any(axis=1)
-        changed = turned[better]
-        nearest[changed] = others[rows, first][better]
-        distances[changed] = further[rows, first][better]
-        cosine[changed] = other_cosine[rows, first][better]
+    bounds = np.minimum(np.hypot(distances[turned], SECOND_LAYER * surface.spacing), gate)
+    further, others = surface.grid.query_facing(
+        points[turned], normals[turned], bounds, surface.normals, min_normal_cosine
+    )
+    better = np.isfinite(further)
+    changed = turned[better]
+    nearest[changed], distances[changed] = others[better], further[better]
+    cosine[changed] = np.einsum("va,va->v", normals[changed], surface.normals[nearest[changed]])
     target, target_normal = surface.points[nearest], surface.normals[nearest]
     off_plane = np.einsum("va,va->v", points - target, target_normal)
     weights = 1.0 / (1.0 + (off_plane / (robust_scale * gate)) ** 2) ** 2

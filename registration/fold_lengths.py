@@ -16,9 +16,9 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float64, Int32
 from numba import njit
-from scipy.spatial import KDTree
 
 from registration.correspondences import ScanSurface
+from registration.point_grid import PointGrid
 
 __all__ = ["edge_faces", "folded_lengths"]
 
@@ -66,9 +66,8 @@ def folded_lengths(
     stride = max(1, len(surface.points) // MAX_POINTS)
     points, normals = surface.points[::stride], surface.normals[::stride]
     centres = vertices[faces].mean(axis=1)
-    tree = KDTree(centres, balanced_tree=False, compact_nodes=False)
     reach = REACH * float(rest_lengths.mean())
-    _, face = tree.query(points, distance_upper_bound=reach)
+    _, face = PointGrid.build(centres, 0.5 * reach).query(points, reach)
     moments, counts = slope_moments(vertices, faces, face, normals, MIN_COSINE)
     return shortened(vertices, edges, faces_of_edges, rest_lengths, moments, counts, MIN_POINTS)
 

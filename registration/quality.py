@@ -21,6 +21,7 @@ from scipy.spatial import KDTree
 from registration.config import QualityConfig
 from registration.correspondences import mesh_normals
 from registration.energies import edge_vectors
+from registration.point_grid import PointGrid
 from registration.register import FrameScan
 from registration.template import TemplateAnalysis
 
@@ -52,7 +53,7 @@ def assess(
 ) -> FrameQuality:
     """Measure a registered frame against its scan."""
     normals = mesh_normals(vertices, analysis.faces)
-    distance, nearest = scan.surface.tree.query(vertices)
+    distance, nearest = scan.surface.grid.query(vertices)
     offset = vertices - scan.surface.points[nearest]
     scan_normals = scan.surface.normals[nearest]
     height = np.abs(np.einsum("va,va->v", offset, scan_normals))
@@ -108,7 +109,8 @@ def border_distances(
 def _points_to_template(points: np.ndarray, vertices: np.ndarray, analysis: TemplateAnalysis) -> np.ndarray:
     """Distance to the faces around each point's nearest template vertex, metres."""
     used = np.unique(analysis.faces)
-    nearest = used[KDTree(vertices[used]).query(points)[1]]
+    cell = 2.0 * float(analysis.rest_lengths.mean())
+    nearest = used[PointGrid.build(vertices[used], cell).query(points)[1]]
     return fan_distances(points, nearest, vertices, analysis.faces, analysis.fan_offsets, analysis.fan_faces)
 
 
@@ -153,55 +155,77 @@ def _percentile(values: np.ndarray, percent: float) -> float:
     return float(np.percentile(values, percent)) if len(values) else float("nan")
 
 
+@njit(cache=True, inline="always")
+def dot3(u, v):
+    return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
+
+
+@njit(cache=True, inline="always")
+def difference3(points, p, q):
+    return points[p, 0] - points[q, 0], points[p, 1] - points[q, 1], points[p, 2] - points[q, 2]
+
+
+@njit(cache=True, inline="always")
+def along3(u, s, v, t):
+    return u[0] * s + v[0] * t, u[1] * s + v[1] * t, u[2] * s + v[2] * t
+
+
+@njit(cache=True)
+def triangle_distance(ap, ab, ac):
+    """Distance of a point to a triangle, both given from its corner a (Ericson 2005, closest point on a triangle)."""
+    d1, d2 = dot3(ab, ap), dot3(ac, ap)
+    bb, bc, cc = dot3(ab, ab), dot3(ab, ac), dot3(ac, ac)
+    d3, d4, d5, d6 = d1 - bb, d2 - bc, d1 - bc, d2 - cc
+    va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
+    if d1 <= 0 and d2 <= 0:
+        closest = along3(ab, 0.0, ac, 0.0)
+    elif d3 >= 0 and d4 <= d3:
+        closest = ab
+    elif d6 >= 0 and d5 <= d6:
+        closest = ac
+    elif vc <= 0 and d1 >= 0 and d3 <= 0:
+        closest = along3(ab, d1 / (d1 - d3), ac, 0.0)
+    elif vb <= 0 and d2 >= 0 and d6 <= 0:
+        closest = along3(ab, 0.0, ac, d2 / (d2 - d6))
+    elif va <= 0 and d4 - d3 >= 0 and d5 - d6 >= 0:
+        share = (d4 - d3) / ((d4 - d3) + (d5 - d6))
+        closest = along3(ab, 1.0 - share, ac, share)
+    else:
+        closest = along3(ab, vb / (va + vb + vc), ac, vc / (va + vb + vc))
+    apart = along3(ap, 1.0, closest, -1.0)
+    return np.sqrt(dot3(apart, apart))
+
+
 @njit(cache=True)
 def fan_distances(points, nearest, vertices, faces, fan_offsets, fan_faces):
-    """Distance of each point to the faces around one vertex (Ericson 2005, closest point on a triangle)."""
+    """Distance of each point to the faces around one vertex."""
     result = np.full(len(points), np.inf)
     for n in range(len(points)):
         for entry in range(fan_offsets[nearest[n]], fan_offsets[nearest[n] + 1]):
-            face = faces[fan_faces[entry]]
-            a, b, c, p = vertices[face[0]], vertices[face[1]], vertices[face[2]], points[n]
-            ab, ac, ap = b - a, c - a, p - a
-            d1, d2 = (ab * ap).sum(), (ac * ap).sum()
-            bp, cp = p - b, p - c
-            d3, d4 = (ab * bp).sum(), (ac * bp).sum()
-            d5, d6 = (ab * cp).sum(), (ac * cp).sum()
-            va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
-            if d1 <= 0 and d2 <= 0:
-                closest = a
-            elif d3 >= 0 and d4 <= d3:
-                closest = b
-            elif d6 >= 0 and d5 <= d6:
-                closest = c
-            elif vc <= 0 and d1 >= 0 and d3 <= 0:
-                closest = a + ab * (d1 / (d1 - d3))
-            elif vb <= 0 and d2 >= 0 and d6 <= 0:
-                closest = a + ac * (d2 / (d2 - d6))
-            elif va <= 0 and d4 - d3 >= 0 and d5 - d6 >= 0:
-                closest = b + (c - b) * ((d4 - d3) / ((d4 - d3) + (d5 - d6)))
-            else:
-                closest = a + ab * (vb / (va + vb + vc)) + ac * (vc / (va + vb + vc))
-            result[n] = min(result[n], np.sqrt(((p - closest) ** 2).sum()))
+            a, b, c = faces[fan_faces[entry], 0], faces[fan_faces[entry], 1], faces[fan_faces[entry], 2]
+            ap = points[n, 0] - vertices[a, 0], points[n, 1] - vertices[a, 1], points[n, 2] - vertices[a, 2]
+            distance = triangle_distance(ap, difference3(vertices, b, a), difference3(vertices, c, a))
+            result[n] = min(result[n], distance)
     return result
 
 
 @njit(cache=True)
-def segment_cuts(start, end, a, b, c):
-    """Whether a segment passes through the inside of a triangle (Moeller and Trumbore 1997)."""
-    d, e1, e2, s = end - start, b - a, c - a, start - a
-    p = np.array([d[1] * e2[2] - d[2] * e2[1], d[2] * e2[0] - d[0] * e2[2], d[0] * e2[1] - d[1] * e2[0]])
-    det = (e1 * p).sum()
+def segment_cuts(vertices, start, end, a, b, c):
+    """Whether the segment between two vertices passes through a triangle (Moeller and Trumbore 1997)."""
+    d, e1, e2 = difference3(vertices, end, start), difference3(vertices, b, a), difference3(vertices, c, a)
+    s = difference3(vertices, start, a)
+    p = d[1] * e2[2] - d[2] * e2[1], d[2] * e2[0] - d[0] * e2[2], d[0] * e2[1] - d[1] * e2[0]
+    det = dot3(e1, p)
     if abs(det) < 1e-18:
         return False
-    u = (s * p).sum() / det
+    u = dot3(s, p) / det
     if u < 0.0 or u > 1.0:
         return False
-    q = np.array([s[1] * e1[2] - s[2] * e1[1], s[2] * e1[0] - s[0] * e1[2], s[0] * e1[1] - s[1] * e1[0]])
-    v = (d * q).sum() / det
+    q = s[1] * e1[2] - s[2] * e1[1], s[2] * e1[0] - s[0] * e1[2], s[0] * e1[1] - s[1] * e1[0]
+    v = dot3(d, q) / det
     if v < 0.0 or u + v > 1.0:
         return False
-    t = (e2 * q).sum() / det
-    return 0.0 <= t <= 1.0
+    return 0.0 <= dot3(e2, q) / det <= 1.0
 
 
 @njit(cache=True)
@@ -210,26 +234,25 @@ def intersecting_faces(vertices, faces, pairs):
     cut = np.zeros(len(faces), np.bool_)
     for n in range(len(pairs)):
         f, g = faces[pairs[n, 0]], faces[pairs[n, 1]]
-        apart = True
-        for i in range(3):
-            for j in range(3):
-                if f[i] == g[j]:
-                    apart = False
+        apart = False
         for axis in range(3):
-            if not apart:
-                break
             low_f = min(vertices[f[0], axis], vertices[f[1], axis], vertices[f[2], axis])
             high_f = max(vertices[f[0], axis], vertices[f[1], axis], vertices[f[2], axis])
             low_g = min(vertices[g[0], axis], vertices[g[1], axis], vertices[g[2], axis])
             high_g = max(vertices[g[0], axis], vertices[g[1], axis], vertices[g[2], axis])
             if low_f > high_g or low_g > high_f:
-                apart = False
-        if not apart:
+                apart = True
+                break
+        for i in range(3):
+            for j in range(3):
+                if f[i] == g[j]:
+                    apart = True
+        if apart:
             continue
         for i in range(3):
             j = (i + 1) % 3
-            if segment_cuts(vertices[f[i]], vertices[f[j]], vertices[g[0]], vertices[g[1]], vertices[g[2]]) or (
-                segment_cuts(vertices[g[i]], vertices[g[j]], vertices[f[0]], vertices[f[1]], vertices[f[2]])
+            if segment_cuts(vertices, f[i], f[j], g[0], g[1], g[2]) or (
+                segment_cuts(vertices, g[i], g[j], f[0], f[1], f[2])
             ):
                 cut[pairs[n, 0]] = True
                 cut[pairs[n, 1]] = True

@@ -88,7 +88,7 @@ def register_frame(
     coarse = config.coarse.cold if schedule == "cold" else config.coarse.warm
     dense = config.dense.cold if schedule == "cold" else config.dense.warm
     vertices, first = _coarse_stage(analysis, scan, start, coarse, config)
-    vertices, second = _dense_stage(analysis, scan, start, vertices, dense, config)
+    vertices, second = _dense_stage(analysis, scan, start, vertices, dense, config, near=schedule == "warm")
     return FrameRegistration(vertices, schedule, first + second)
 
 
@@ -158,6 +158,8 @@ def _dense_stage(
     vertices: np.ndarray,
     schedule: Schedule,
     config: RegistrationConfig,
+    *,
+    near: bool,
 ) -> tuple[np.ndarray, int]:
     count = len(vertices)
     iterations = 0
@@ -168,7 +170,7 @@ def _dense_stage(
     )
     reference = analysis.laplacian_rows.apply(vertices[:, :, None])
     lengths = analysis.rest_lengths
-    if schedule.steps and config.dense.fold_lengths:
+    if near and config.dense.fold_lengths:
         lengths = folded_lengths(
             scan.surface, vertices, analysis.faces, analysis.edges, analysis.edge_faces, analysis.rest_lengths
         )

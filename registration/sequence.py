@@ -215,15 +215,20 @@ def _choose(
 ) -> tuple[str, np.ndarray, Literal["cold", "warm"]]:
     """The prediction nearest to the scan, and whether it is near enough for the warm schedule."""
     subset = analysis.coarse_vertices
-    misfits = {name: scan.surface.tree.query(vertices[subset])[0] for name, vertices in candidates.items()}
+    misfits = {name: _distances(scan, vertices[subset]) for name, vertices in candidates.items()}
     if "carried" in candidates and "previous" in candidates:
         share = _share_of_carried(analysis, misfits["carried"], misfits["previous"])[:, None]
         candidates["blended"] = share * candidates.pop("carried") + (1.0 - share) * candidates.pop("previous")
-        misfits["blended"] = scan.surface.tree.query(candidates["blended"][subset])[0]
+        misfits["blended"] = _distances(scan, candidates["blended"][subset])
     median = {name: float(np.median(misfits[name])) for name in candidates}
     name = min(median, key=lambda key: median[key])
     near = max(config.sequence.cold_above, COLD_SPACINGS * scan.surface.spacing)
     return name, candidates[name], "cold" if distant or median[name] > near else "warm"
+
+
+def _distances(scan: FrameScan, points: np.ndarray) -> np.ndarray:
+    """To the nearest scan vertex, metres, at most the reach of a blend."""
+    return np.minimum(scan.surface.grid.query(points, BLEND_REACH)[0], BLEND_REACH)
 
 
 def _share_of_carried(analysis: TemplateAnalysis, carried: np.ndarray, previous: np.ndarray) -> np.ndarray:
@@ -236,7 +241,7 @@ def _share_of_carried(analysis: TemplateAnalysis, carried: np.ndarray, previous:
     subset = analysis.coarse_vertices
     squares = []
     for misfit in (carried, previous):
-        spread = weights[subset] * (np.minimum(misfit, BLEND_REACH)[:, None] ** 2 + BLEND_FLOOR**2)
+        spread = weights[subset] * (misfit[:, None] ** 2 + BLEND_FLOOR**2)
         total = np.bincount(nodes[subset].reshape(-1), spread.reshape(-1), minlength=len(analysis.graph.nodes))
         squares.append(total)
     share = squares[1] / np.maximum(squares[0] + squares[1], 1e-30)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.spatial import KDTree
 
 from capture4d.mesh import unique_edges
 from registration.correspondences import ScanSurface
 from registration.fold_lengths import edge_faces, folded_lengths
+from registration.point_grid import PointGrid
 
 
 def _sheet(size: int, spacing: float) -> tuple[np.ndarray, np.ndarray]:
@@ -27,7 +27,7 @@ def _corrugated(amplitude: float, wavelength: float, extent: float, tilt: np.nda
     normals = np.column_stack([-amplitude * k * np.cos(k * x), np.zeros(len(x)), np.ones(len(x))])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     points = np.column_stack([x, y, amplitude * np.sin(k * x)]) @ tilt.T
-    return ScanSurface(points, normals @ tilt.T, np.zeros(len(x), bool), KDTree(points), 0.001)
+    return ScanSurface(points, normals @ tilt.T, np.zeros(len(x), bool), PointGrid.build(points, 0.003), 0.001)
 
 
 @pytest.mark.parametrize("amplitude", [0.0, 0.0005, 0.001])
