@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, Float64, UInt8
 from numba import njit
 from scipy import sparse
 from scipy.sparse import csgraph
@@ -25,7 +25,15 @@ from capture4d.errors import InputError
 from capture4d.mesh_kernels import face_components, open_vertices
 from capture4d.types import GarmentScan, Mesh, Scan
 
-__all__ = ["ColourNotFoundError", "classify_colours", "extract_garment", "painted_border"]
+__all__ = [
+    "ColourNotFoundError",
+    "classify_colours",
+    "encode_colours",
+    "extract_garment",
+    "linear_colours",
+    "painted_border",
+    "settle_labels",
+]
 
 Colour = tuple[int, int, int]
 
@@ -33,6 +41,8 @@ OTHER, GARMENT, FIRST_PAINT = 0, 1, 2
 
 MAX_ANGLE = 0.24
 """Largest angle between a colour and a paint in linear RGB, radians: shading under tinted light stays below 0.15."""
+BRIGHTNESS_WEIGHT = 0.1
+"""Where all colours are known: radians of angle that a factor e of brightness counts for."""
 LIGHTNESS_RANGE = (0.12, 4.0)
 """Brightness relative to the paint's own that still counts as shading."""
 MIN_SHARE = 1e-3
@@ -52,19 +62,25 @@ class ColourNotFoundError(InputError):
 
 
 def extract_garment(
-    scan: Scan, garment_colour: Colour, boundary_colours: Mapping[str, Colour], *, source: str = "scan"
+    scan: Scan,
+    garment_colour: Colour,
+    boundary_colours: Mapping[str, Colour],
+    *,
+    other_colours: tuple[Colour, ...] = (),
+    source: str = "scan",
 ) -> GarmentScan:
     """Cut the garment out of a scan.
 
     Args:
         garment_colour: sRGB of the cloth.
         boundary_colours: sRGB of the paint on each named border; equal colours cannot tell their loops apart.
+        other_colours: sRGB of what else there is, where it is known: suit, skin.
         source: how errors call the scan, usually its path.
     Raises:
         ColourNotFoundError: the garment's or a border's colour is not in the scan.
     """
     paints = tuple(dict.fromkeys(boundary_colours.values()))
-    labels = classify_colours(scan.colours, garment_colour, paints)
+    labels = classify_colours(scan.colours, garment_colour, paints, others=other_colours)
     _require_colours(labels, garment_colour, paints, source)
     faces = scan.mesh.faces
     labels = settle_labels(faces, labels)
@@ -97,9 +113,7 @@ def painted_border(
     Raises:
         ColourNotFoundError: the paint is not in the scan.
     """
-    label = _label_table(paint, ())
-    quantised = (colours >> 2).astype(np.int32)
-    painted = label[(quantised[:, 0] << 12) | (quantised[:, 1] << 6) | quantised[:, 2]] == GARMENT
+    painted = classify_colours(colours, paint, ()) == GARMENT
     if painted.mean() < MIN_SHARE:
         raise ColourNotFoundError(
             f"{source}: border colour {_hex(paint)} not found: expected at least {100 * MIN_SHARE:g} % of the "
@@ -110,35 +124,47 @@ def painted_border(
 
 
 def classify_colours(
-    colours: UInt8[np.ndarray, "verts 3"], garment_colour: Colour, paints: tuple[Colour, ...]
+    colours: UInt8[np.ndarray, "verts 3"],
+    garment_colour: Colour,
+    paints: tuple[Colour, ...],
+    *,
+    others: tuple[Colour, ...] = (),
 ) -> UInt8[np.ndarray, " verts"]:
     """0 for anything else, 1 for the garment, 2 and on for the paints, vertex by vertex."""
-    table = _label_table(garment_colour, paints)
+    table = _label_table(garment_colour, paints, others)
     quantised = (colours >> 2).astype(np.int32)
     return table[(quantised[:, 0] << 12) | (quantised[:, 1] << 6) | quantised[:, 2]]
 
 
 @lru_cache(maxsize=8)
-def _label_table(garment_colour: Colour, paints: tuple[Colour, ...]) -> np.ndarray:
+def _label_table(garment_colour: Colour, paints: tuple[Colour, ...], others: tuple[Colour, ...]) -> np.ndarray:
     """Labels of all colours at six bits per channel: classifying a scan is one look-up."""
     level = np.arange(64) * 4 + 2
     red, green, blue = np.meshgrid(level, level, level, indexing="ij")
-    colours = _linear(np.stack([red, green, blue], axis=-1).reshape(-1, 3))
+    colours = linear_colours(np.stack([red, green, blue], axis=-1).reshape(-1, 3))
     brightness = np.linalg.norm(colours, axis=1)
-    references = _linear(np.array([garment_colour, *paints], np.float64))
+    references = linear_colours(np.array([garment_colour, *paints, *others], np.float64))
     reference_brightness = np.maximum(np.linalg.norm(references, axis=1), 1e-4)
     cosine = (colours @ references.T) / np.maximum(brightness[:, None] * reference_brightness, 1e-9)
     angle = np.arccos(np.clip(cosine, -1.0, 1.0))
     ratio = brightness[:, None] / reference_brightness
     angle[(ratio < LIGHTNESS_RANGE[0]) | (ratio > LIGHTNESS_RANGE[1]) | (angle > MAX_ANGLE)] = np.inf
-    nearest = np.argmin(angle, axis=1)
-    return np.where(np.isfinite(angle.min(axis=1)), nearest + 1, OTHER).astype(np.uint8)
+    nearest = np.argmin(angle + BRIGHTNESS_WEIGHT * np.abs(np.log(ratio + 1e-9)) * bool(others), axis=1)
+    wanted = np.isfinite(angle.min(axis=1)) & (nearest <= len(paints))
+    return np.where(wanted, nearest + 1, OTHER).astype(np.uint8)
 
 
-def _linear(colours: np.ndarray) -> np.ndarray:
-    """sRGB to linear light; shading scales the latter."""
+def linear_colours(colours: np.ndarray) -> Float64[np.ndarray, "colours 3"]:
+    """sRGB, 0 to 255, to linear light, 0 to 1; shading scales the latter."""
     value = colours / 255.0
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+
+
+def encode_colours(light: Float64[np.ndarray, "colours 3"]) -> UInt8[np.ndarray, "colours 3"]:
+    """Linear light to sRGB; what is too bright is clipped."""
+    light = np.clip(light, 0, 1)
+    value = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    return np.rint(255 * value).astype(np.uint8)
 
 
 def _require_colours(labels: np.ndarray, garment_colour: Colour, paints: tuple[Colour, ...], source: str) -> None:
