@@ -1,9 +1,9 @@
 """Colours of a take, learned from a few of its scans without labels: garment, painted borders, and all the rest.
 
-Light first. Neighbours on a scan are mostly of one material, so that what their colours differ by is light. The logarithm
-of the light, channel by channel, is a polynomial in the normal and the place; it is fitted to differences of neighbours,
-robustly, because at the edge of a paint they differ by more (the retinex assumption). Divided by the light, a material is
-one colour wherever it is.
+Light first. Neighbours on a scan are mostly of one material, so that what their colours differ by is light. The
+logarithm of the light, channel by channel, is a polynomial in the normal and the place; it is fitted to differences of
+neighbours, robustly, because at the edge of a paint they differ by more (the retinex assumption). Divided by the light,
+a material is one colour wherever it is.
 
 Then materials: modes of the density of colours, where the angle in linear RGB counts most and brightness a little.
 Colours between two materials that are nowhere but between them are their blend.
@@ -23,7 +23,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import Float64, Real, UInt8
 from scipy.spatial import KDTree
 
 from capture4d.errors import InputError
@@ -125,6 +125,8 @@ def learn_colours(
     given_paints = None if paints is None else [_among(paint, colours, source, "border") for paint in paints]
     given_garment = None if garment is None else _among(garment, colours, source, "garment")
     bands = _bands(scans, labels, colours) if given_paints is None else given_paints
+    if given_paints is not None:
+        _require_apart([*given_paints, *([] if given_garment is None else [given_garment])], colours, source)
     bands = [band for band in bands if band != given_garment]
     cloth = _garment(scans, labels, len(colours), bands, colours, source) if given_garment is None else given_garment
     others = [index for index in range(len(colours)) if index != cloth and index not in bands]
@@ -148,7 +150,7 @@ def fit_light(scans: Sequence[Scan]) -> Light:
         chosen = _spread(len(scan.mesh.vertices), SAMPLES)
         terms = _terms(scan.mesh, centre, size)[chosen]
         value = np.log(linear_colours(_smoothed(scan.mesh.faces, scan.colours)[chosen]) + FLOOR)
-        _, near = KDTree(scan.mesh.vertices[chosen]).query(scan.mesh.vertices[chosen], NEIGHBOURS + 1)
+        near = _neighbours(scan.mesh.vertices[chosen], NEIGHBOURS + 1)[1]
         start, end = np.repeat(np.arange(len(chosen)), NEIGHBOURS), near[:, 1:].reshape(-1)
         known = end < len(chosen)  # fewer points than neighbours
         start, end = start[known], end[known]
@@ -184,6 +186,12 @@ def _terms(mesh: Mesh, centre: np.ndarray, size_m: float) -> Float64[np.ndarray,
     return np.column_stack([np.ones(len(x)), x, y, z, x * y, y * z, z * x, x * x - y * y, 3 * z * z - 1, place])
 
 
+def _neighbours(points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Distances to the nearest points, each itself the first, and their indices."""
+    distance, index = KDTree(points).query(points, count)
+    return np.asarray(distance), np.asarray(index)
+
+
 # --- materials ---------------------------------------------------------------------------------------------------
 
 
@@ -206,7 +214,7 @@ def _smoothed(faces: np.ndarray, colours: np.ndarray) -> UInt8[np.ndarray, "vert
     return np.rint(mixed).astype(np.uint8)
 
 
-def _features(colours: UInt8[np.ndarray, "colours 3"]) -> Float64[np.ndarray, "colours 4"]:
+def _features(colours: Real[np.ndarray, "colours 3"]) -> Float64[np.ndarray, "colours 4"]:
     """Direction of linear RGB and, less important, its brightness: distances are close to radians of colour angle."""
     light = linear_colours(colours) + 1e-4
     brightness = np.linalg.norm(light, axis=1)
@@ -215,43 +223,47 @@ def _features(colours: UInt8[np.ndarray, "colours 3"]) -> Float64[np.ndarray, "c
 
 def _materials(colours: UInt8[np.ndarray, "verts 3"]) -> list[Colour]:
     """Modes of the density of colours, the most frequent first."""
-    chosen = colours[_spread(len(colours), SAMPLES)]
+    chosen, count = _cells(colours[_spread(len(colours), SAMPLES)])
     points = _features(chosen)
     tree = KDTree(points)
     pairs = tree.sparse_distance_matrix(tree, 3 * KERNEL, output_type="coo_matrix")
-    weights = np.exp(-((pairs.data / KERNEL) ** 2) / 2)
+    weights = count[pairs.col] * np.exp(-((pairs.data / KERNEL) ** 2) / 2)
     density = np.bincount(pairs.row, weights, minlength=len(points))
     order = np.lexsort((np.arange(len(points)), -density))
-    modes: list[int] = []
-    owner = np.zeros(len(points), np.int64)
-    distance, near = tree.query(points, min(48, len(points)))
     rank = np.empty(len(points), np.int64)
     rank[order] = np.arange(len(points))
+    distance, near = _neighbours(points, min(48, len(points)))
+    owner, modes = np.zeros(len(points), np.int64), np.zeros(0, np.int64)
     for point in order.tolist():
         denser = near[point][(rank[near[point]] < rank[point]) & (distance[point] < MODE_DISTANCE)]
         if len(denser):
             owner[point] = owner[denser[0]]
             continue
-        apart = np.linalg.norm(points[modes] - points[point], axis=1) if modes else np.zeros(0)
-        if len(apart) and apart.min() < MODE_DISTANCE:
-            owner[point] = int(apart.argmin())
-        else:
-            owner[point] = len(modes)
-            modes.append(point)
-    count = np.bincount(owner, minlength=len(modes))
-    kept = [index for index in np.argsort(-count, kind="stable") if count[index] >= MIN_SHARE * len(points)]
-    middles = [_middle(chosen[(owner == index)], points[owner == index], points[modes[index]]) for index in kept]
-    return [(int(red), int(green), int(blue)) for red, green, blue in middles]
+        apart = np.append(np.linalg.norm(points[modes] - points[point], axis=1), MODE_DISTANCE)
+        owner[point] = int(apart.argmin())
+        if owner[point] == len(modes):
+            modes = np.append(modes, point)
+    total = np.bincount(owner, count, minlength=len(modes))
+    kept = [index for index in np.argsort(-total, kind="stable") if total[index] >= MIN_SHARE * count.sum()]
+    materials = []
+    for index in kept:
+        near_mode = (owner == index) & (np.linalg.norm(points - points[modes[index]], axis=1) < 2 * KERNEL)
+        red, green, blue = np.rint(np.average(chosen[near_mode], axis=0, weights=count[near_mode])).astype(int).tolist()
+        materials.append((red, green, blue))
+    return materials
 
 
-def _middle(colours: np.ndarray, points: np.ndarray, mode: np.ndarray) -> np.ndarray:
-    """Median colour of what is near a mode."""
-    near = np.linalg.norm(points - mode, axis=1) < 2 * KERNEL
-    return np.median(colours[near], axis=0)
+def _cells(colours: UInt8[np.ndarray, "verts 3"]) -> tuple[np.ndarray, np.ndarray]:
+    """Colours that agree in six bits a channel as their mean, and how many there are of each."""
+    codes = (colours >> 2).astype(np.int64) @ np.array([1 << 12, 1 << 6, 1])
+    _, cell, count = np.unique(codes, return_inverse=True, return_counts=True)
+    sums = [np.bincount(cell, colours[:, channel]) for channel in range(3)]
+    return np.stack(sums, axis=1) / count[:, None], count
 
 
 def _nearest(colours: UInt8[np.ndarray, "verts 3"], materials: Sequence[Colour]) -> UInt8[np.ndarray, " verts"]:
-    return KDTree(_features(np.array(materials, np.uint8))).query(_features(colours))[1].astype(np.uint8)
+    nearest = KDTree(_features(np.array(materials, np.uint8))).query(_features(colours))[1]
+    return np.asarray(nearest).astype(np.uint8)
 
 
 def _among(colour: Colour, materials: Sequence[Colour], source: str, role: str) -> int:
@@ -266,6 +278,15 @@ def _among(colour: Colour, materials: Sequence[Colour], source: str, role: str) 
             f"found {', '.join(_hex(material) for material in materials)}"
         )
     return best
+
+
+def _require_apart(chosen: Sequence[int], colours: Sequence[Colour], source: str) -> None:
+    twice = [index for index in chosen if chosen.count(index) > 1]
+    if twice:
+        raise ColoursNotSeparableError(
+            f"{source}: the colours given for garment and borders are not separable: two of them are "
+            f"{_hex(colours[twice[0]])} in the scans"
+        )
 
 
 def _hex(colour: Colour) -> str:
@@ -335,7 +356,7 @@ def _garment(
         large = np.flatnonzero(size > 0.005 * len(faces))
         edges = {int(root): np.unique(faces[piece == root]) for root in large}
         paint = np.flatnonzero(np.isin(label, bands))
-        for root, own in edges.items():
+        for own in edges.values():
             index = int(label[own[0]])
             apart = (
                 paint

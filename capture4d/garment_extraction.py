@@ -13,6 +13,7 @@ moved outwards by what is missing.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -53,6 +54,8 @@ FAR_SIDE = 0.6
 """A border point is at least this share of the band's width away from garment colour."""
 EROSION = 0.9
 """Sample spacings by which fused scans stop short of an open border (measured against the synthetic scanner)."""
+CONNECTED = 0.2
+"""Share of a border's open vertices where the scan goes on, above which the border is where the paint ends."""
 EVEN_BAND = 2.0
 """A band counts as even if its widths (20 to 90 %) differ by less than this many sample spacings."""
 
@@ -94,7 +97,8 @@ def extract_garment(
     renumbered = (np.cumsum(used) - 1).astype(np.int32)
     mesh = Mesh(scan.mesh.vertices[used], renumbered[faces[mask]])
     kept = labels[used]
-    points, paint = _border_points(mesh, kept, len(paints))
+    goes_on = ~open_vertices(faces, len(labels))[0][used]
+    points, paint = _border_points(mesh, kept, len(paints), goes_on)
     loop_of_paint = _loops_of_paints(boundary_colours, paints)
     return GarmentScan(
         mesh=mesh,
@@ -194,31 +198,48 @@ def _garment_faces(faces: np.ndarray, labels: np.ndarray) -> np.ndarray:
     return inside & keep[np.maximum(part, 0)]
 
 
-def _border_points(mesh: Mesh, labels: np.ndarray, paints: int) -> tuple[np.ndarray, np.ndarray]:
+def _border_points(
+    mesh: Mesh, labels: np.ndarray, paints: int, goes_on: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Points on the true border, float32, and the paint of each.
 
-    A scan ends about a sample before the surface does, and sometimes several. Where the band is of even width, each
-    open vertex is moved outwards by what is missing from that width; else by the one sample.
+    Args:
+        goes_on: vertices where the scan goes on beyond what was cut out.
+
+    Where the scan mostly goes on, the border is where the paint ends, a band's width from garment colour along the
+    surface. Where it ends there, it ends about a sample before the surface does, and sometimes several: if the band is
+    of even width, each open vertex is moved outwards by what is missing from that width; else by the one sample.
     """
     points, labels_of = [np.zeros((0, 3), np.float32)], [np.zeros(0, labels.dtype)]
     if not paints:
         return points[0], labels_of[0]
-    rim, inner = _across_the_paint(mesh, labels)
+    band = _across_the_paint(mesh, labels)
+    rim, inner = band.rim, band.nearest[band.rim_here]
     outer = mesh.vertices[rim].astype(np.float64)
     across = outer - inner
-    width_here = np.linalg.norm(across, axis=1)
+    straight = np.linalg.norm(across, axis=1)
     spacing = _spacing(mesh)
     paint_here = labels[rim]
+    ends = np.zeros(len(rim), bool) if goes_on is None else goes_on[rim]
     for paint in range(FIRST_PAINT, FIRST_PAINT + paints):
         own = np.flatnonzero(paint_here == paint)
         if not len(own):
             continue
-        own = own[width_here[own] >= FAR_SIDE * np.percentile(width_here[own], 75)]
-        narrow, full = np.percentile(width_here[own], (20, 90))
-        missing = np.full(len(own), EROSION * spacing)
-        if full - narrow < EVEN_BAND * spacing:
-            missing = np.clip(full + 0.2 * spacing - width_here[own], 0.0, 2.5 * spacing)
-        direction = across[own] / width_here[own, None]
+        own = own[straight[own] >= FAR_SIDE * np.percentile(straight[own], 75)]
+        if ends[own].mean() > CONNECTED:
+            walked = band.distance[band.rim_here]
+            width = float(np.percentile(walked[own[ends[own]]], 40))
+            crossings = band.crossings(width, labels[band.vertices] == paint)
+            points.append(crossings.astype(np.float32))
+            labels_of.append(np.full(len(crossings), paint, labels.dtype))
+            own = own[(walked[own] < width) & (walked[own] > FAR_SIDE * width)]
+            missing = np.clip(width - walked[own], 0.0, 2.5 * spacing)
+        else:
+            narrow, full = np.percentile(straight[own], (20, 90))
+            missing = np.full(len(own), EROSION * spacing)
+            if full - narrow < EVEN_BAND * spacing:
+                missing = np.clip(full + 0.2 * spacing - straight[own], 0.0, 2.5 * spacing)
+        direction = across[own] / straight[own, None]
         points.append((outer[own] + missing[:, None] * direction).astype(np.float32))
         labels_of.append(np.full(len(own), paint, labels.dtype))
     return np.concatenate(points), np.concatenate(labels_of)
@@ -230,11 +251,38 @@ def _spacing(mesh: Mesh) -> float:
     return float(np.linalg.norm(mesh.vertices[some[:, 0]] - mesh.vertices[some[:, 1]], axis=1).mean())
 
 
-def _across_the_paint(mesh: Mesh, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Open painted vertices that are connected to garment colour, and the nearest point of that colour for each.
+@dataclass(frozen=True, slots=True, eq=False)
+class _Band:
+    """What is painted, and the garment vertices next to it."""
 
-    Nearest along the surface: a cuff may touch the flank.
-    """
+    vertices: np.ndarray
+    """Of the mesh: the paint and its neighbours."""
+    positions: np.ndarray
+    edges: np.ndarray
+    """(E, 2) into `vertices`."""
+    distance: np.ndarray
+    """To garment colour, along the edges of the mesh; infinite where the paint is not connected to any."""
+    nearest: np.ndarray
+    """Position of the garment vertex there."""
+    rim_here: np.ndarray
+    """Open painted vertices that are connected to garment colour, as indices into `vertices`."""
+
+    @property
+    def rim(self) -> np.ndarray:
+        return self.vertices[self.rim_here]
+
+    def crossings(self, distance: float, chosen: np.ndarray) -> np.ndarray:
+        """(C, 3) points on the edges between chosen vertices at which the distance is so large."""
+        start, end = self.edges[chosen[self.edges].all(axis=1)].T
+        near, far = self.distance[start], self.distance[end]
+        passes = ((near < distance) != (far < distance)) & np.isfinite(near) & np.isfinite(far)
+        share = (distance - near[passes]) / (far[passes] - near[passes])
+        first = self.positions[start[passes]]
+        return first + share[:, None] * (self.positions[end[passes]] - first)
+
+
+def _across_the_paint(mesh: Mesh, labels: np.ndarray) -> _Band:
+    """The way from garment colour across the paint, along the surface: a cuff may touch the flank."""
     is_open, _ = open_vertices(mesh.faces, len(mesh.vertices))
     painted = labels >= FIRST_PAINT
     local, renumbered = np.unique(mesh.faces[painted[mesh.faces].any(axis=1)], return_inverse=True)
@@ -246,11 +294,13 @@ def _across_the_paint(mesh: Mesh, labels: np.ndarray) -> tuple[np.ndarray, np.nd
     length = np.maximum(np.linalg.norm(positions[start] - positions[end], axis=1), 1e-9)
     graph = sparse.csr_array((length, (start, end)), shape=(len(local), len(local)))
     sources = np.flatnonzero(~painted[local])
-    if not len(sources):
-        return np.zeros(0, np.int64), np.zeros((0, 3))
-    _, _, source = csgraph.dijkstra(graph, directed=False, indices=sources, min_only=True, return_predecessors=True)
+    distance, source = np.full(len(local), np.inf), np.full(len(local), -1)
+    if len(sources):
+        distance, _, source = csgraph.dijkstra(
+            graph, directed=False, indices=sources, min_only=True, return_predecessors=True
+        )
     rim = np.flatnonzero(is_open[local] & painted[local] & (source >= 0))
-    return local[rim], positions[source[rim]]
+    return _Band(local, positions, np.stack([start, end], axis=1), distance, positions[source], rim)
 
 
 def _loops_of_paints(boundary_colours: Mapping[str, Colour], paints: tuple[Colour, ...]) -> np.ndarray:

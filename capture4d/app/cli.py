@@ -189,11 +189,20 @@ class Extract(_Stage):
     """Capture folder."""
     output: Path
     """Work folder; gets garment/."""
+    learn_colours: bool = False
+    """Learn the colours from the scans even where capture.json gives them; they then say which is which. Without
+    garment_colour in capture.json they are learned anyway."""
 
     def __call__(self) -> int:
         from capture4d.garment_stage import run
 
-        run(self.capture, self.output / "garment", workers=self.workers, overwrite=self.overwrite)
+        run(
+            self.capture,
+            self.output / "garment",
+            learn_colours=self.learn_colours,
+            workers=self.workers,
+            overwrite=self.overwrite,
+        )
         print(f"garment: {self.output / 'garment'}")
         return 0
 
