@@ -22,6 +22,7 @@ from numba import njit
 from scipy import sparse
 from scipy.sparse import csgraph
 
+from capture4d.border_loops import straighten
 from capture4d.errors import InputError
 from capture4d.mesh_kernels import face_components, open_vertices
 from capture4d.types import GarmentScan, Mesh, Scan
@@ -56,6 +57,8 @@ EROSION = 0.9
 """Sample spacings by which fused scans stop short of an open border (measured against the synthetic scanner)."""
 CONNECTED = 0.2
 """Share of a border's open vertices where the scan goes on, above which the border is where the paint ends."""
+STRAIGHTENED = 3.0
+"""Border points are drawn to the line through their neighbours within so many sample spacings."""
 EVEN_BAND = 2.0
 """A band counts as even if its widths (20 to 90 %) differ by less than this many sample spacings."""
 
@@ -226,12 +229,11 @@ def _border_points(
         if not len(own):
             continue
         own = own[straight[own] >= FAR_SIDE * np.percentile(straight[own], 75)]
+        found = []
         if ends[own].mean() > CONNECTED:
             walked = band.distance[band.rim_here]
             width = float(np.percentile(walked[own[ends[own]]], 40))
-            crossings = band.crossings(width, labels[band.vertices] == paint)
-            points.append(crossings.astype(np.float32))
-            labels_of.append(np.full(len(crossings), paint, labels.dtype))
+            found.append(band.crossings(width, labels[band.vertices] == paint))
             own = own[(walked[own] < width) & (walked[own] > FAR_SIDE * width)]
             missing = np.clip(width - walked[own], 0.0, 2.5 * spacing)
         else:
@@ -240,8 +242,9 @@ def _border_points(
             if full - narrow < EVEN_BAND * spacing:
                 missing = np.clip(full + 0.2 * spacing - straight[own], 0.0, 2.5 * spacing)
         direction = across[own] / straight[own, None]
-        points.append((outer[own] + missing[:, None] * direction).astype(np.float32))
-        labels_of.append(np.full(len(own), paint, labels.dtype))
+        found.append(outer[own] + missing[:, None] * direction)
+        points.append(straighten(np.concatenate(found), STRAIGHTENED * spacing).astype(np.float32))
+        labels_of.append(np.full(len(points[-1]), paint, labels.dtype))
     return np.concatenate(points), np.concatenate(labels_of)
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from capture4d.border_loops import loop_order, name_shirt_loops
 from capture4d.colour_learning import Light, learn_colours
 from capture4d.errors import InputError
 from capture4d.garment_extraction import extract_garment
@@ -102,7 +103,22 @@ def cut_out(scan: Scan, colours: KnownColours, *, source: str = "scan") -> Garme
     garment = extract_garment(
         colours.flat(scan), colours.garment, colours.boundary, other_colours=colours.others, source=source
     )
-    if colours.loop_names == garment.loop_names:
+    if colours.light is None:
         return garment
-    unknown = np.full(len(garment.boundary_points), -1, np.int32)
-    return replace(garment, boundary_loops=unknown, loop_names=colours.loop_names)
+    if colours.loop_names != garment.loop_names:
+        unknown = np.full(len(garment.boundary_points), -1, np.int32)
+        garment = replace(garment, boundary_loops=unknown, loop_names=colours.loop_names)
+    if (garment.boundary_loops < 0).all():
+        named = name_shirt_loops(garment.boundary_points, garment.loop_names)
+        garment = replace(garment, boundary_loops=named)
+    return _in_order(garment)
+
+
+def _in_order(garment: GarmentScan) -> GarmentScan:
+    """Border points loop by loop, each in order around it; those of no known loop last."""
+    points, loops = garment.boundary_points, garment.boundary_loops
+    parts = [np.flatnonzero(loops == loop) for loop in range(len(garment.loop_names))]
+    parts = [own[loop_order(points[own])] for own in parts if len(own) > 2]
+    known = np.concatenate([*parts, np.zeros(0, np.int64)])
+    order = np.concatenate([known, np.setdiff1d(np.arange(len(points)), known)])
+    return replace(garment, boundary_points=points[order], boundary_loops=loops[order])
