@@ -168,13 +168,13 @@ def _robust_fit(design: np.ndarray, target: np.ndarray) -> np.ndarray:
     All channels share the weights: paint changes them together.
     """
     solution = np.zeros((design.shape[1], target.shape[1]))
-    ridge = 1e-4 * len(design) * np.eye(design.shape[1] - 1)
     varying = design[:, 1:]
     for _ in range(12):
         residual = target - design @ solution
         weight = 1 / (1 + ((residual / EDGE_SCALE) ** 2).sum(axis=1))
         weighted = varying * weight[:, None]
-        solution[1:] = np.linalg.solve(weighted.T @ varying + ridge * weight.mean() * 1e-2, weighted.T @ target)
+        ridge = 1e-6 * weight.sum() * np.eye(varying.shape[1])
+        solution[1:] = np.linalg.solve(weighted.T @ varying + ridge, weighted.T @ target)
     return solution
 
 
@@ -202,16 +202,13 @@ def _spread(count: int, wanted: int) -> np.ndarray:
 
 def _smoothed(faces: np.ndarray, colours: np.ndarray) -> UInt8[np.ndarray, "verts 3"]:
     """Each colour and the mean of its neighbours' in equal parts, for noise."""
-    total, count = colours.astype(np.float64), np.ones(len(colours))
-    sums, weight = np.zeros_like(total), np.zeros(len(colours))
-    for corner in range(3):
-        for step in (1, 2):
-            other = faces[:, (corner + step) % 3]
-            for channel in range(3):
-                sums[:, channel] += np.bincount(faces[:, corner], total[other, channel], minlength=len(colours))
-            weight += np.bincount(faces[:, corner], minlength=len(colours))
-    mixed = (total + sums / np.maximum(weight, 1)[:, None]) / (count + (weight > 0))[:, None]
-    return np.rint(mixed).astype(np.uint8)
+    count = len(colours)
+    corner, other = np.concatenate([faces, faces]).ravel(), np.roll(faces, 1, axis=1).ravel()
+    other = np.concatenate([other, np.roll(faces, 2, axis=1).ravel()])
+    weight = np.bincount(corner, minlength=count)[:, None]
+    sums = np.stack([np.bincount(corner, colours[other, channel], minlength=count) for channel in range(3)], axis=1)
+    mean = np.where(weight > 0, sums / np.maximum(weight, 1), colours)
+    return np.rint((colours + mean) / 2).astype(np.uint8)
 
 
 def _features(colours: Real[np.ndarray, "colours 3"]) -> Float64[np.ndarray, "colours 4"]:
