@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from capture4d.body_tracking_config import TrackingConfig
 from capture4d.colour_learning import ColoursNotSeparableError, fit_light, learn_colours
 from capture4d.garment_extraction import encode_colours, extract_garment, linear_colours
 from capture4d.garment_stage import load_garment_scan, run
@@ -208,3 +209,13 @@ def write_textured(path: Path, mesh: Mesh) -> None:
     lines += [f"vt 0.5 {y / 0.6:.6f}" for y in mesh.vertices[:, 1].tolist()]
     lines += [f"f {a}/{a} {b}/{b} {c}/{c}" for a, b, c in (mesh.faces + 1).tolist()]
     path.with_suffix(".obj").write_text("\n".join(lines) + "\n")
+
+
+def test_tracking_sees_the_same_cloth_without_colours(tube_capture: Path) -> None:
+    from capture4d.body_stage import _points
+
+    given = _points(read_capture(tube_capture), 6, TrackingConfig())
+    without_colours(tube_capture)
+    blind = _points(read_capture(tube_capture), 6, TrackingConfig())
+    np.testing.assert_array_equal(blind.points, given.points)
+    np.testing.assert_array_equal(blind.cloth, given.cloth)
