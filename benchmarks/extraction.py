@@ -11,6 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import get_args
 
@@ -27,7 +28,7 @@ from capture4d.records import load_poses
 from capture4d.scans import read_body, read_capture, read_truth_frame, read_truth_model
 from capture4d.take_colours import KnownColours, cut_out
 from capture4d.types import GarmentScan, Mesh, Scan
-from data_synth.border_paint import paint_borders
+from data_synth.border_paint import PaintedSheet, paint_borders
 from data_synth.cached_takes import cached_take
 from data_synth.config import PRESETS
 from data_synth.outfits import OUTFITS, OutfitName
@@ -154,16 +155,22 @@ class _Take:
         return _Dressed(read_truth_frame(capture, capture.frame_ids[row]).vertices, posed.astype(np.float32))
 
 
-def _scan(take: _Take, case: _Case, dressed: _Dressed, seed: int) -> tuple[Scan, np.ndarray, Mesh]:
-    """A scan, whether each of its vertices is on the garment, and the true surface."""
-    outfit, fusion = OUTFITS[case.outfit], case.scanner.fusion
-    sheet = paint_borders(
+@lru_cache(maxsize=1)
+def _painted(take: _Take, name: OutfitName, max_edge_m: float) -> PaintedSheet:
+    outfit = OUTFITS[name]
+    return paint_borders(
         take.fine,
         width_m=BAND_M,
         garment_colour=outfit.garment,
         border_colours=[outfit.border],
-        max_edge_m=fusion.garment_voxel_m,
+        max_edge_m=max_edge_m,
     )
+
+
+def _scan(take: _Take, case: _Case, dressed: _Dressed, seed: int) -> tuple[Scan, np.ndarray, Mesh]:
+    """A scan, whether each of its vertices is on the garment, and the true surface."""
+    outfit, fusion = OUTFITS[case.outfit], case.scanner.fusion
+    sheet = _painted(take, case.outfit, fusion.garment_voxel_m)
     suit = np.where(take.bare[:, None], outfit.skin, outfit.suit).astype(np.uint8)
     surfaces = [
         Surface(sheet.posed(dressed.cloth), sheet.colours, LABEL_GARMENT, fusion.garment_voxel_m),
