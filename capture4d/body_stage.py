@@ -31,6 +31,7 @@ from capture4d.motion_files import read_motion
 from capture4d.records import ArrayFile, load_body, load_poses, save_body, save_poses
 from capture4d.scan_points import scan_points
 from capture4d.scans import Capture, capture_digest, read_body, read_capture, read_scan, scan_path
+from capture4d.take_colours import take_colours
 from capture4d.types import Body, PoseSequence
 from capture4d.workdir import (
     Stage,
@@ -151,12 +152,11 @@ def _tracker(folder: Path, config: TrackingConfig) -> Tracker:
 
 def _points(capture: Capture, frame_id: int, config: TrackingConfig) -> ScanPoints:
     """Points of a scan; none where it cannot be read, which loses the frame."""
-    paints = tuple(dict.fromkeys(capture.boundary_colours.values()))
     try:
-        scan = read_scan(capture, frame_id)
-        return scan_points(
-            scan, capture.garment_colour, paints, config.sampling, source=str(scan_path(capture, frame_id))
-        )
+        colours = take_colours(capture)
+        scan = colours.flat(read_scan(capture, frame_id))
+        paints = tuple(dict.fromkeys(colours.boundary.values()))
+        return scan_points(scan, colours.garment, paints, config.sampling, source=str(scan_path(capture, frame_id)))
     except InputError:
         if frame_id == capture.frame_ids[0]:
             raise

@@ -13,19 +13,29 @@ moved outwards by what is missing.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, Float64, UInt8
 from numba import njit
 from scipy import sparse
 from scipy.sparse import csgraph
 
+from capture4d.border_loops import straighten
 from capture4d.errors import InputError
 from capture4d.mesh_kernels import face_components, open_vertices
 from capture4d.types import GarmentScan, Mesh, Scan
 
-__all__ = ["ColourNotFoundError", "classify_colours", "extract_garment", "painted_border"]
+__all__ = [
+    "ColourNotFoundError",
+    "classify_colours",
+    "encode_colours",
+    "extract_garment",
+    "linear_colours",
+    "painted_border",
+    "settle_labels",
+]
 
 Colour = tuple[int, int, int]
 
@@ -33,6 +43,8 @@ OTHER, GARMENT, FIRST_PAINT = 0, 1, 2
 
 MAX_ANGLE = 0.24
 """Largest angle between a colour and a paint in linear RGB, radians: shading under tinted light stays below 0.15."""
+BRIGHTNESS_WEIGHT = 0.1
+"""Where all colours are known: radians of angle that a factor e of brightness counts for."""
 LIGHTNESS_RANGE = (0.12, 4.0)
 """Brightness relative to the paint's own that still counts as shading."""
 MIN_SHARE = 1e-3
@@ -43,6 +55,10 @@ FAR_SIDE = 0.6
 """A border point is at least this share of the band's width away from garment colour."""
 EROSION = 0.9
 """Sample spacings by which fused scans stop short of an open border (measured against the synthetic scanner)."""
+CONNECTED = 0.2
+"""Share of a border's open vertices where the scan goes on, above which the border is where the paint ends."""
+STRAIGHTENED = 3.0
+"""Border points are drawn to the line through their neighbours within so many sample spacings."""
 EVEN_BAND = 2.0
 """A band counts as even if its widths (20 to 90 %) differ by less than this many sample spacings."""
 
@@ -52,19 +68,25 @@ class ColourNotFoundError(InputError):
 
 
 def extract_garment(
-    scan: Scan, garment_colour: Colour, boundary_colours: Mapping[str, Colour], *, source: str = "scan"
+    scan: Scan,
+    garment_colour: Colour,
+    boundary_colours: Mapping[str, Colour],
+    *,
+    other_colours: tuple[Colour, ...] = (),
+    source: str = "scan",
 ) -> GarmentScan:
     """Cut the garment out of a scan.
 
     Args:
         garment_colour: sRGB of the cloth.
         boundary_colours: sRGB of the paint on each named border; equal colours cannot tell their loops apart.
+        other_colours: sRGB of what else there is, where it is known: suit, skin.
         source: how errors call the scan, usually its path.
     Raises:
         ColourNotFoundError: the garment's or a border's colour is not in the scan.
     """
     paints = tuple(dict.fromkeys(boundary_colours.values()))
-    labels = classify_colours(scan.colours, garment_colour, paints)
+    labels = classify_colours(scan.colours, garment_colour, paints, others=other_colours)
     _require_colours(labels, garment_colour, paints, source)
     faces = scan.mesh.faces
     labels = settle_labels(faces, labels)
@@ -78,7 +100,8 @@ def extract_garment(
     renumbered = (np.cumsum(used) - 1).astype(np.int32)
     mesh = Mesh(scan.mesh.vertices[used], renumbered[faces[mask]])
     kept = labels[used]
-    points, paint = _border_points(mesh, kept, len(paints))
+    goes_on = ~open_vertices(faces, len(labels))[0][used]
+    points, paint = _border_points(mesh, kept, len(paints), goes_on)
     loop_of_paint = _loops_of_paints(boundary_colours, paints)
     return GarmentScan(
         mesh=mesh,
@@ -97,9 +120,7 @@ def painted_border(
     Raises:
         ColourNotFoundError: the paint is not in the scan.
     """
-    label = _label_table(paint, ())
-    quantised = (colours >> 2).astype(np.int32)
-    painted = label[(quantised[:, 0] << 12) | (quantised[:, 1] << 6) | quantised[:, 2]] == GARMENT
+    painted = classify_colours(colours, paint, ()) == GARMENT
     if painted.mean() < MIN_SHARE:
         raise ColourNotFoundError(
             f"{source}: border colour {_hex(paint)} not found: expected at least {100 * MIN_SHARE:g} % of the "
@@ -110,35 +131,47 @@ def painted_border(
 
 
 def classify_colours(
-    colours: UInt8[np.ndarray, "verts 3"], garment_colour: Colour, paints: tuple[Colour, ...]
+    colours: UInt8[np.ndarray, "verts 3"],
+    garment_colour: Colour,
+    paints: tuple[Colour, ...],
+    *,
+    others: tuple[Colour, ...] = (),
 ) -> UInt8[np.ndarray, " verts"]:
     """0 for anything else, 1 for the garment, 2 and on for the paints, vertex by vertex."""
-    table = _label_table(garment_colour, paints)
+    table = _label_table(garment_colour, paints, others)
     quantised = (colours >> 2).astype(np.int32)
     return table[(quantised[:, 0] << 12) | (quantised[:, 1] << 6) | quantised[:, 2]]
 
 
 @lru_cache(maxsize=8)
-def _label_table(garment_colour: Colour, paints: tuple[Colour, ...]) -> np.ndarray:
+def _label_table(garment_colour: Colour, paints: tuple[Colour, ...], others: tuple[Colour, ...]) -> np.ndarray:
     """Labels of all colours at six bits per channel: classifying a scan is one look-up."""
     level = np.arange(64) * 4 + 2
     red, green, blue = np.meshgrid(level, level, level, indexing="ij")
-    colours = _linear(np.stack([red, green, blue], axis=-1).reshape(-1, 3))
+    colours = linear_colours(np.stack([red, green, blue], axis=-1).reshape(-1, 3))
     brightness = np.linalg.norm(colours, axis=1)
-    references = _linear(np.array([garment_colour, *paints], np.float64))
+    references = linear_colours(np.array([garment_colour, *paints, *others], np.float64))
     reference_brightness = np.maximum(np.linalg.norm(references, axis=1), 1e-4)
     cosine = (colours @ references.T) / np.maximum(brightness[:, None] * reference_brightness, 1e-9)
     angle = np.arccos(np.clip(cosine, -1.0, 1.0))
     ratio = brightness[:, None] / reference_brightness
     angle[(ratio < LIGHTNESS_RANGE[0]) | (ratio > LIGHTNESS_RANGE[1]) | (angle > MAX_ANGLE)] = np.inf
-    nearest = np.argmin(angle, axis=1)
-    return np.where(np.isfinite(angle.min(axis=1)), nearest + 1, OTHER).astype(np.uint8)
+    nearest = np.argmin(angle + BRIGHTNESS_WEIGHT * np.abs(np.log(ratio + 1e-9)) * bool(others), axis=1)
+    wanted = np.isfinite(angle.min(axis=1)) & (nearest <= len(paints))
+    return np.where(wanted, nearest + 1, OTHER).astype(np.uint8)
 
 
-def _linear(colours: np.ndarray) -> np.ndarray:
-    """sRGB to linear light; shading scales the latter."""
+def linear_colours(colours: np.ndarray) -> Float64[np.ndarray, "colours 3"]:
+    """sRGB, 0 to 255, to linear light, 0 to 1; shading scales the latter."""
     value = colours / 255.0
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+
+
+def encode_colours(light: Float64[np.ndarray, "colours 3"]) -> UInt8[np.ndarray, "colours 3"]:
+    """Linear light to sRGB; what is too bright is clipped."""
+    light = np.clip(light, 0, 1)
+    value = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    return np.rint(255 * value).astype(np.uint8)
 
 
 def _require_colours(labels: np.ndarray, garment_colour: Colour, paints: tuple[Colour, ...], source: str) -> None:
@@ -168,33 +201,50 @@ def _garment_faces(faces: np.ndarray, labels: np.ndarray) -> np.ndarray:
     return inside & keep[np.maximum(part, 0)]
 
 
-def _border_points(mesh: Mesh, labels: np.ndarray, paints: int) -> tuple[np.ndarray, np.ndarray]:
+def _border_points(
+    mesh: Mesh, labels: np.ndarray, paints: int, goes_on: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Points on the true border, float32, and the paint of each.
 
-    A scan ends about a sample before the surface does, and sometimes several. Where the band is of even width, each
-    open vertex is moved outwards by what is missing from that width; else by the one sample.
+    Args:
+        goes_on: vertices where the scan goes on beyond what was cut out.
+
+    Where the scan mostly goes on, the border is where the paint ends, a band's width from garment colour along the
+    surface. Where it ends there, it ends about a sample before the surface does, and sometimes several: if the band is
+    of even width, each open vertex is moved outwards by what is missing from that width; else by the one sample.
     """
     points, labels_of = [np.zeros((0, 3), np.float32)], [np.zeros(0, labels.dtype)]
     if not paints:
         return points[0], labels_of[0]
-    rim, inner = _across_the_paint(mesh, labels)
+    band = _across_the_paint(mesh, labels)
+    rim, inner = band.rim, band.nearest[band.rim_here]
     outer = mesh.vertices[rim].astype(np.float64)
     across = outer - inner
-    width_here = np.linalg.norm(across, axis=1)
+    straight = np.linalg.norm(across, axis=1)
     spacing = _spacing(mesh)
     paint_here = labels[rim]
+    ends = np.zeros(len(rim), bool) if goes_on is None else goes_on[rim]
     for paint in range(FIRST_PAINT, FIRST_PAINT + paints):
         own = np.flatnonzero(paint_here == paint)
         if not len(own):
             continue
-        own = own[width_here[own] >= FAR_SIDE * np.percentile(width_here[own], 75)]
-        narrow, full = np.percentile(width_here[own], (20, 90))
-        missing = np.full(len(own), EROSION * spacing)
-        if full - narrow < EVEN_BAND * spacing:
-            missing = np.clip(full + 0.2 * spacing - width_here[own], 0.0, 2.5 * spacing)
-        direction = across[own] / width_here[own, None]
-        points.append((outer[own] + missing[:, None] * direction).astype(np.float32))
-        labels_of.append(np.full(len(own), paint, labels.dtype))
+        own = own[straight[own] >= FAR_SIDE * np.percentile(straight[own], 75)]
+        found = []
+        if ends[own].mean() > CONNECTED:
+            walked = band.distance[band.rim_here]
+            width = float(np.percentile(walked[own[ends[own]]], 40))
+            found.append(band.crossings(width, labels[band.vertices] == paint))
+            own = own[(walked[own] < width) & (walked[own] > FAR_SIDE * width)]
+            missing = np.clip(width - walked[own], 0.0, 2.5 * spacing)
+        else:
+            narrow, full = np.percentile(straight[own], (20, 90))
+            missing = np.full(len(own), EROSION * spacing)
+            if full - narrow < EVEN_BAND * spacing:
+                missing = np.clip(full + 0.2 * spacing - straight[own], 0.0, 2.5 * spacing)
+        direction = across[own] / straight[own, None]
+        found.append(outer[own] + missing[:, None] * direction)
+        points.append(straighten(np.concatenate(found), STRAIGHTENED * spacing).astype(np.float32))
+        labels_of.append(np.full(len(points[-1]), paint, labels.dtype))
     return np.concatenate(points), np.concatenate(labels_of)
 
 
@@ -204,11 +254,38 @@ def _spacing(mesh: Mesh) -> float:
     return float(np.linalg.norm(mesh.vertices[some[:, 0]] - mesh.vertices[some[:, 1]], axis=1).mean())
 
 
-def _across_the_paint(mesh: Mesh, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Open painted vertices that are connected to garment colour, and the nearest point of that colour for each.
+@dataclass(frozen=True, slots=True, eq=False)
+class _Band:
+    """What is painted, and the garment vertices next to it."""
 
-    Nearest along the surface: a cuff may touch the flank.
-    """
+    vertices: np.ndarray
+    """Of the mesh: the paint and its neighbours."""
+    positions: np.ndarray
+    edges: np.ndarray
+    """(E, 2) into `vertices`."""
+    distance: np.ndarray
+    """To garment colour, along the edges of the mesh; infinite where the paint is not connected to any."""
+    nearest: np.ndarray
+    """Position of the garment vertex there."""
+    rim_here: np.ndarray
+    """Open painted vertices that are connected to garment colour, as indices into `vertices`."""
+
+    @property
+    def rim(self) -> np.ndarray:
+        return self.vertices[self.rim_here]
+
+    def crossings(self, distance: float, chosen: np.ndarray) -> np.ndarray:
+        """(C, 3) points on the edges between chosen vertices at which the distance is so large."""
+        start, end = self.edges[chosen[self.edges].all(axis=1)].T
+        near, far = self.distance[start], self.distance[end]
+        passes = ((near < distance) != (far < distance)) & np.isfinite(near) & np.isfinite(far)
+        share = (distance - near[passes]) / (far[passes] - near[passes])
+        first = self.positions[start[passes]]
+        return first + share[:, None] * (self.positions[end[passes]] - first)
+
+
+def _across_the_paint(mesh: Mesh, labels: np.ndarray) -> _Band:
+    """The way from garment colour across the paint, along the surface: a cuff may touch the flank."""
     is_open, _ = open_vertices(mesh.faces, len(mesh.vertices))
     painted = labels >= FIRST_PAINT
     local, renumbered = np.unique(mesh.faces[painted[mesh.faces].any(axis=1)], return_inverse=True)
@@ -220,11 +297,13 @@ def _across_the_paint(mesh: Mesh, labels: np.ndarray) -> tuple[np.ndarray, np.nd
     length = np.maximum(np.linalg.norm(positions[start] - positions[end], axis=1), 1e-9)
     graph = sparse.csr_array((length, (start, end)), shape=(len(local), len(local)))
     sources = np.flatnonzero(~painted[local])
-    if not len(sources):
-        return np.zeros(0, np.int64), np.zeros((0, 3))
-    _, _, source = csgraph.dijkstra(graph, directed=False, indices=sources, min_only=True, return_predecessors=True)
+    distance, source = np.full(len(local), np.inf), np.full(len(local), -1)
+    if len(sources):
+        distance, _, source = csgraph.dijkstra(
+            graph, directed=False, indices=sources, min_only=True, return_predecessors=True
+        )
     rim = np.flatnonzero(is_open[local] & painted[local] & (source >= 0))
-    return local[rim], positions[source[rim]]
+    return _Band(local, positions, np.stack([start, end], axis=1), distance, positions[source], rim)
 
 
 def _loops_of_paints(boundary_colours: Mapping[str, Colour], paints: tuple[Colour, ...]) -> np.ndarray:

@@ -1,6 +1,7 @@
 """The stage that cuts the garment out of every scan: CAPTURE in, WORK/garment out.
 
-The colours must be in the first frame, or else capture.json is wrong. In a later frame that lacks them, because the
+Colours that capture.json does not give are learned from a few scans first, and written to colours.json. All must be in
+the first frame, or else capture.json is wrong. In a later frame that lacks them, because the
 subject has left the volume or hides a border, the reason is written instead of a garment, and registration flags it.
 """
 
@@ -10,14 +11,16 @@ import zipfile
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from capture4d.errors import InputError
-from capture4d.garment_extraction import ColourNotFoundError, extract_garment
-from capture4d.scans import Capture, capture_digest, read_capture, read_scan, scan_path
+from capture4d.garment_extraction import ColourNotFoundError
+from capture4d.scans import Capture, capture_digest, format_colour, read_capture, read_scan, scan_path
+from capture4d.take_colours import KnownColours, cut_out, take_colours
 from capture4d.types import GarmentScan, Mesh
-from capture4d.workdir import open_stage, run_jobs, write_npz
+from capture4d.workdir import open_stage, run_jobs, write_json, write_npz
 
 __all__ = ["load_garment_scan", "run", "save_garment_scan"]
 
@@ -26,48 +29,64 @@ SCHEMA = 1
 
 @dataclass(frozen=True, slots=True)
 class ExtractionSettings:
-    """What decides the result, besides the capture; the colours are the capture's."""
+    """What decides the result, besides the capture."""
 
     schema: int = SCHEMA
+    learn_colours: bool = False
 
 
-def run(capture: Path, output: Path, *, workers: int = 1, overwrite: bool = False) -> str:
+def run(capture: Path, output: Path, *, learn_colours: bool = False, workers: int = 1, overwrite: bool = False) -> str:
     """Extract the garment of every frame that has none yet; the digest of the result.
 
+    Args:
+        learn_colours: learn all colours from the scans, not only those that capture.json leaves open.
     Raises:
-        InputError: a scan is missing, damaged, without colours, or without the garment's colours.
+        InputError: a scan is missing, damaged, without colours, or without the garment's colours; or these are to be
+            learned and are not separable.
     """
     description = read_capture(capture)
     stage = open_stage(
         output,
         name="extract",
         schema=SCHEMA,
-        config=ExtractionSettings(),
+        config=ExtractionSettings(learn_colours=learn_colours),
         upstream={"capture": capture_digest(description)},
         sources={"capture": capture},
         overwrite=overwrite,
     )
-    first = description.frame_ids[0]
-    if stage.pending([first]):
-        save_garment_scan(stage.frame_path(first), extract_frame(description, first))
-    jobs = [(frame_id, stage.frame_path(frame_id)) for frame_id in stage.pending(description.frame_ids)]
-    for _ in run_jobs(partial(write_frame, description), jobs, workers=workers, label="extract garment"):
-        pass
-    return stage.finish([stage.frame_path(frame_id) for frame_id in description.frame_ids])
+    colours_path = stage.path / "colours.json"
+    pending = stage.pending(description.frame_ids)
+    if pending or not colours_path.is_file():
+        colours = take_colours(description, learn=learn_colours)
+        write_json(colours_path, _described(colours))
+        first = description.frame_ids[0]
+        if first in pending:
+            save_garment_scan(stage.frame_path(first), extract_frame(description, colours, first))
+        jobs = [(frame_id, stage.frame_path(frame_id)) for frame_id in stage.pending(description.frame_ids)]
+        for _ in run_jobs(partial(write_frame, description, colours), jobs, workers=workers, label="extract garment"):
+            pass
+    return stage.finish([colours_path, *(stage.frame_path(frame_id) for frame_id in description.frame_ids)])
 
 
-def extract_frame(capture: Capture, frame_id: int) -> GarmentScan:
+def _described(colours: KnownColours) -> dict[str, Any]:
+    return {
+        "learned": colours.light is not None,
+        "garment_colour": format_colour(colours.garment),
+        "boundary_colours": {name: format_colour(colour) for name, colour in colours.boundary.items()},
+        "other_colours": [format_colour(colour) for colour in colours.others],
+    }
+
+
+def extract_frame(capture: Capture, colours: KnownColours, frame_id: int) -> GarmentScan:
     """Read one scan and cut its garment out."""
-    scan = read_scan(capture, frame_id)
-    source = str(scan_path(capture, frame_id))
-    return extract_garment(scan, capture.garment_colour, capture.boundary_colours, source=source)
+    return cut_out(read_scan(capture, frame_id), colours, source=str(scan_path(capture, frame_id)))
 
 
-def write_frame(capture: Capture, job: tuple[int, Path]) -> None:
+def write_frame(capture: Capture, colours: KnownColours, job: tuple[int, Path]) -> None:
     """Extract one frame and write it, or the reason why there is nothing to write."""
     frame_id, path = job
     try:
-        save_garment_scan(path, extract_frame(capture, frame_id))
+        save_garment_scan(path, extract_frame(capture, colours, frame_id))
     except ColourNotFoundError as error:
         write_npz(path, reason=np.array(str(error)))
 

@@ -91,9 +91,11 @@ class Capture:
     fps: float
     frame_ids: tuple[int, ...]
     """The capture's own frame numbers, ascending."""
-    garment_colour: Colour
+    garment_colour: Colour | None
+    """None: to be learned from the scans."""
     boundary_colours: Mapping[str, Colour] = field(default_factory=dict)
-    """Paint on each border loop; the same colour may serve several. Empty: no painted borders."""
+    """Paint on each border loop; the same colour may serve several. Empty: no painted borders, or, where the garment's
+    colour is to be learned, those that are found."""
     units: Units = "m"
     """Of the scan files. What `read_scan` returns is in metres."""
 
@@ -147,6 +149,10 @@ def parse_colour(text: str) -> Colour:
     return red, green, blue
 
 
+def _optional_colour(text: str | None) -> Colour | None:
+    return None if text is None else parse_colour(text)
+
+
 def _parse_units(text: str) -> Units:
     for units in get_args(Units):
         if text == units:
@@ -180,7 +186,7 @@ def read_capture(path: str | Path) -> Capture:
             name=str(found.get("name", path.resolve().name)),
             fps=float(found["fps"]),
             frame_ids=tuple(int(frame_id) for frame_id in found.get("frames") or sorted(present)),
-            garment_colour=parse_colour(found["garment_colour"]),
+            garment_colour=_optional_colour(found.get("garment_colour")),
             boundary_colours={name: parse_colour(text) for name, text in found.get("boundary_colours", {}).items()},
             units=_parse_units(found.get("units", "m")),
         )
@@ -208,7 +214,7 @@ def write_capture_description(capture: Capture) -> None:
             "name": capture.name,
             "fps": capture.fps,
             "units": capture.units,
-            "garment_colour": format_colour(capture.garment_colour),
+            "garment_colour": None if capture.garment_colour is None else format_colour(capture.garment_colour),
             "boundary_colours": {name: format_colour(colour) for name, colour in capture.boundary_colours.items()},
             "frames": list(capture.frame_ids),
         },

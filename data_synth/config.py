@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from data_synth.scanner_config import FusionConfig, RigConfig, ScannerConfig
+from data_synth.outfits import OutfitName
+from data_synth.scanner_config import FusionConfig, RigConfig, ScannerConfig, StereoConfig
 
 ClipName = Literal["range-of-motion", "twist", "reach", "side-bend", "sampled"]
 
@@ -150,6 +151,8 @@ class SynthConfig:
     """Vertices of the registration template."""
     fabric: Literal["jersey", "shirt-cotton", "linen"] = "jersey"
     style: GarmentStyle = field(default_factory=GarmentStyle)
+    outfit: OutfitName = "blue"
+    """Colours of garment, border paint and suit."""
     motion: MotionConfig = field(default_factory=MotionConfig)
     simulation: SimulationConfig = field(default_factory=SimulationConfig)
     relaxation: RelaxationConfig = field(default_factory=RelaxationConfig)
@@ -176,6 +179,7 @@ PRESETS: dict[str, SynthConfig] = {
         ),
         relaxation=RelaxationConfig(vertices=12_000, sweeps=40),
         scanner=ScannerConfig(
+            stereo=StereoConfig(pods=10, image_size=384, supersampling=1, speckle_window_px=60),
             rig=RigConfig(cameras=24, image_size=320),
             fusion=FusionConfig(garment_voxel_m=0.005, body_voxel_m=0.009, min_component_faces=120),
         ),

@@ -19,7 +19,7 @@ from data_synth.border_paint import paint_borders
 from data_synth.config import MotionConfig
 from data_synth.motions import make_motion
 from data_synth.raycast import Surface
-from data_synth.rig import bounding_sphere, capture_rig
+from data_synth.rig import bounding_sphere, scanner_rig
 from data_synth.scanner import LABEL_BODY, LABEL_GARMENT, scan_surfaces
 from data_synth.scanner_config import FusionConfig, RigConfig, ScannerConfig
 
@@ -180,11 +180,4 @@ def _shirt(vertices: np.ndarray, faces: np.ndarray, kept: np.ndarray) -> np.ndar
 
 def _rig(config: PlainTakeConfig, extent: list[np.ndarray]) -> Rig:
     centre, radius = bounding_sphere(np.array(extent if config.rig_follows_walk else extent[:1]))
-    rig = config.scanner.rig
-    return capture_rig(
-        centre=centre,
-        radius=max(radius, 0.58),
-        cameras=rig.cameras,
-        image_size=rig.image_size,
-        field_of_view_deg=rig.field_of_view_deg,
-    )
+    return scanner_rig(config.scanner, centre=centre, radius=max(radius, 0.58))

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, no_type_check
 
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float32, Integer, UInt8
 from numba import njit
 
-from capture4d.mesh import vertex_normals
 from capture4d.open3d_loading import import_open3d
 from capture4d.types import Mesh, Rig
 
-__all__ = ["NOTHING", "CameraImages", "Surface", "SurfaceScene"]
+__all__ = ["NOTHING", "CameraImages", "Surface", "SurfaceScene", "nearest_surface"]
 
 NOTHING = 255
 """In a surface image: no surface."""
+SHADOW_BIAS = 0.001
+"""A surface this share of the way to a lamp before a point does not shade it."""
 TILE = 8
 """Rays are cast in square tiles of pixels; one probe ray per tile decides whether it is worth it."""
 
@@ -50,15 +51,27 @@ class CameraImages:
     origin: tuple[int, int]
     """Row and column of the window's first pixel in the whole image."""
 
+    @property
+    def window(self) -> tuple[slice, slice]:
+        """Rows and columns of the whole image."""
+        top, left = self.origin
+        return slice(top, top + self.depth.shape[0]), slice(left, left + self.depth.shape[1])
+
 
 class SurfaceScene:
     """Surfaces, lit and ready to be seen from many cameras."""
 
-    def __init__(self, surfaces: Sequence[Surface], *, ambient: float = 1.0, thickness_m: float = 0.0) -> None:
+    def __init__(
+        self,
+        surfaces: Sequence[Surface],
+        *,
+        lit: Callable[[Surface], Float32[np.ndarray, "verts 3"]] | None = None,
+        thickness_m: float = 0.0,
+    ) -> None:
         """Light the surfaces.
 
         Args:
-            ambient: share of the light that comes from everywhere.
+            lit: vertex colours, 0 to 1, under the light; None shows the surfaces' own colours.
             thickness_m: how much nearer the back of a surface is than its front.
         """
         geometry = import_open3d().t.geometry
@@ -67,7 +80,7 @@ class SurfaceScene:
         self._first_face = np.cumsum([0, *(len(s.mesh.faces) for s in surfaces)])
         for surface in surfaces:
             self._scene.add_triangles(_tensor(surface.mesh.vertices), _tensor(surface.mesh.faces.astype(np.uint32)))
-        corner_colours = [light(s, ambient=ambient)[s.mesh.faces] for s in surfaces]
+        corner_colours = [(lit or unlit)(s)[s.mesh.faces] for s in surfaces]
         self._corner_colours = np.concatenate(corner_colours)  # (F, 3 corners, 3)
 
     def view(self, rig: Rig, camera: int) -> CameraImages | None:
@@ -107,6 +120,17 @@ class SurfaceScene:
         )
         return CameraImages(depth, cosine, surface, colours, origin=(int(top), int(left)))
 
+    def incidence(
+        self, points: Float32[np.ndarray, "points 3"], lamp: Float32[np.ndarray, " 3"]
+    ) -> Float32[np.ndarray, " points"]:
+        """Cosine of the angle at which light from a point reaches points of the surfaces, 0 in the shadow."""
+        rays = np.empty((len(points), 6), np.float32)
+        rays[:, :3], rays[:, 3:] = lamp, points - lamp
+        answer = self._scene.cast_rays(_tensor(rays), nthreads=1)
+        reached = answer["t_hit"].numpy() > 1 - SHADOW_BIAS
+        toward = np.einsum("ij,ij->i", rays[:, 3:], answer["primitive_normals"].numpy())
+        return np.where(reached, np.abs(toward) / np.linalg.norm(rays[:, 3:], axis=1), np.float32(0))
+
     def _occupied_tiles(self, rig: Rig, camera: int, width: int, height: int) -> Bool[np.ndarray, "rows columns"]:
         """Tiles whose centre, or a neighbour's, hits something."""
         columns, rows = -(-width // TILE), -(-height // TILE)
@@ -117,14 +141,17 @@ class SurfaceScene:
         return tiles[:, :-2] | tiles[:, 1:-1] | tiles[:, 2:]
 
 
-def light(surface: Surface, *, ambient: float) -> Float32[np.ndarray, "verts 3"]:
-    """Vertex colours, 0 to 1, under an even light and two weak lamps, front left and back right of the subject."""
-    normals = vertex_normals(surface.mesh.vertices, surface.mesh.faces)
-    key = np.array([0.45, 0.6, 0.66], np.float32)
-    fill = np.array([-0.6, 0.2, -0.77], np.float32)
-    lamps = 0.75 * np.clip(normals @ key, 0, None) + 0.45 * np.clip(normals @ fill, 0, None)
-    shade = ambient + (1 - ambient) * 1.5 * lamps
-    return (surface.colours.astype(np.float32) / 255 * shade[:, None]).astype(np.float32)
+def nearest_surface(meshes: Sequence[Mesh], points: Float32[np.ndarray, "points 3"]) -> Integer[np.ndarray, " points"]:
+    """Which of the meshes is nearest to each point."""
+    scene = import_open3d().t.geometry.RaycastingScene(nthreads=1)
+    for mesh in meshes:
+        scene.add_triangles(_tensor(mesh.vertices), _tensor(mesh.faces.astype(np.uint32)))
+    return scene.compute_closest_points(_tensor(points), nthreads=1)["geometry_ids"].numpy()
+
+
+def unlit(surface: Surface) -> Float32[np.ndarray, "verts 3"]:
+    """The surface's own colours, 0 to 1."""
+    return surface.colours.astype(np.float32) / 255
 
 
 def _rays(rig: Rig, camera: int, u: np.ndarray, v: np.ndarray) -> Float32[np.ndarray, "rays 6"]:

@@ -1,4 +1,4 @@
-"""Camera rigs of a 4D capture stage: three rings around the subject, a few cameras above and below."""
+"""Rigs of a 4D capture stage: three rings of cameras, or of stereo pods, around the subject, a few above and below."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from jaxtyping import Float64
 
 from capture4d.errors import InputError
 from capture4d.types import Rig
+from data_synth.scanner_config import ScannerConfig, StereoConfig
 
-__all__ = ["bounding_sphere", "capture_rig", "look_at"]
+__all__ = ["bounding_sphere", "capture_rig", "look_at", "pod_rig", "scanner_rig"]
 
 Point = tuple[float, float, float] | np.ndarray
 
@@ -83,6 +84,52 @@ def capture_rig(
         distortion=np.zeros((cameras, 5)),
         T_camera_world=np.stack(transforms),
         image_sizes=np.full((cameras, 2), image_size, np.int32),
+    )
+
+
+def pod_rig(*, centre: Point, radius: float, config: StereoConfig) -> Rig:
+    """Pairs of parallel cameras, left and right in turn, around a subject.
+
+    A pod's principal points are shifted so that both its cameras see the same square at the distance of the subject:
+    there the disparity is zero. Rows correspond: the pairs are rectified as they are.
+
+    Args:
+        centre, radius: sphere around what is to be captured, metres.
+    """
+    if not config.baseline_m > 0:
+        raise InputError(f"baseline_m: expected a positive length in metres, found {config.baseline_m}")
+    pods = capture_rig(
+        centre=centre,
+        radius=radius,
+        cameras=config.pods,
+        image_size=config.image_size,
+        field_of_view_deg=config.field_of_view_deg,
+    )
+    distance = np.linalg.norm(pods.centres - np.asarray(centre, float), axis=1)
+    sides = np.tile([-0.5, 0.5], config.pods) * config.baseline_m
+    intrinsics, transforms = np.repeat(pods.intrinsics, 2, axis=0), np.repeat(pods.T_camera_world, 2, axis=0)
+    transforms[:, 0, 3] -= sides
+    intrinsics[:, 0, 2] += intrinsics[:, 0, 0] * sides / np.repeat(distance, 2)
+    return Rig(
+        names=tuple(f"{name}_{side}" for name in pods.names for side in ("left", "right")),
+        intrinsics=intrinsics,
+        distortion=np.zeros((2 * config.pods, 5)),
+        T_camera_world=transforms,
+        image_sizes=np.repeat(pods.image_sizes, 2, axis=0),
+    )
+
+
+def scanner_rig(config: ScannerConfig, *, centre: Point, radius: float) -> Rig:
+    """The rig of a scanner around a sphere, metres: depth cameras or stereo pods."""
+    if config.sensor == "stereo":
+        return pod_rig(centre=centre, radius=radius, config=config.stereo)
+    rig = config.rig
+    return capture_rig(
+        centre=centre,
+        radius=radius,
+        cameras=rig.cameras,
+        image_size=rig.image_size,
+        field_of_view_deg=rig.field_of_view_deg,
     )
 
 

@@ -35,7 +35,7 @@ from capture4d.types import Garment, Mesh
 from capture4d.workdir import Stage, file_digest, open_stage, run_jobs
 from data_synth.border_paint import PaintedSheet, paint_borders
 from data_synth.mesh_sequence import MeshSequence, open_sequence
-from data_synth.rig import bounding_sphere, capture_rig
+from data_synth.rig import bounding_sphere, scanner_rig
 from data_synth.scanner import LABEL_GARMENT, Surface, scan_surfaces
 from data_synth.scanner_config import ScanConfig
 
@@ -162,17 +162,7 @@ def _prepare(stage: Stage, source: _Source, template: Path | None) -> bool:
             write_truth_model(model, TruthModel(first, loops, faces, barycentric))
         corners = np.stack([lower, upper])
         centre, radius = bounding_sphere(corners)
-        options = source.config.scanner.rig
-        save_rig(
-            rig,
-            capture_rig(
-                centre=centre,
-                radius=radius,
-                cameras=options.cameras,
-                image_size=options.image_size,
-                field_of_view_deg=options.field_of_view_deg,
-            ),
-        )
+        save_rig(rig, scanner_rig(source.config.scanner, centre=centre, radius=radius))
     return model.is_file()
 
 

@@ -2,12 +2,14 @@
 
 Every camera sees depth and colour by ray casting (`raycast`), its sensor adds correlated noise and loses pixels
 (`depth_noise`), and the images are fused into a mesh (`fusion`). Holes are not drawn: they are where fewer than two
-cameras see the surface.
+cameras see the surface. The stereo scanner matches pairs of images under a speckle pattern instead (`stereo`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import UInt8
@@ -18,12 +20,16 @@ from capture4d.mesh import face_areas
 from capture4d.types import Mesh, Rig, Scan
 from data_synth.depth_noise import corrupt_depth, draw_noise_fields
 from data_synth.fusion import DepthFusion
-from data_synth.raycast import Surface, SurfaceScene
+from data_synth.lighting import light
+from data_synth.raycast import NOTHING, Surface, SurfaceScene, nearest_surface
 from data_synth.scanner_config import ScannerConfig
+from data_synth.stereo import match_pair, speckle_pair
 
 __all__ = ["LABEL_BODY", "LABEL_BORDER", "LABEL_GARMENT", "Surface", "scan_surfaces"]
 
 LABEL_BODY, LABEL_GARMENT, LABEL_BORDER = 0, 1, 2
+BACKDROP = np.float32(0.05)
+"""Of the room, as the colour cameras see it."""
 
 
 def scan_surfaces(
@@ -51,10 +57,12 @@ def scan_surfaces(
         raise InputError("rig.distortion: the scanner needs undistorted cameras, found non-zero coefficients")
     if not surfaces:
         raise InputError("surfaces: expected at least one, found none")
-    scene = SurfaceScene(surfaces, ambient=config.shading.ambient, thickness_m=config.fusion.thickness_m)
+    if config.sensor == "stereo":
+        return _scan_stereo(rig, surfaces, config, rng, frame_id, time_s)
+    lit = partial(light, rig=rig, shading=config.shading)
+    scene = SurfaceScene(surfaces, lit=lit, thickness_m=config.fusion.thickness_m)
     fields = draw_noise_fields(config.noise, rng, largest_image=int(rig.image_sizes.max()))
-    areas = [float(face_areas(s.mesh.vertices, s.mesh.faces).sum()) for s in surfaces]
-    sized = list(zip(surfaces, areas, strict=True))
+    sized = [(surface, _area(surface)) for surface in surfaces]
     volumes = [DepthFusion(surface.voxel_m, area, config=config.fusion) for surface, area in sized]
     insides = [DepthFusion(surface.voxel_m, 0.1 * area, config=config.fusion) for surface, area in sized]
     sides = [(volumes, 1), (insides, -1)] if config.fusion.inside else [(volumes, 1)]
@@ -75,6 +83,41 @@ def scan_surfaces(
     return _merge(parts, frame_id, time_s)
 
 
+def _scan_stereo(
+    rig: Rig,
+    surfaces: Sequence[Surface],
+    config: ScannerConfig,
+    rng: np.random.Generator,
+    frame_id: int,
+    time_s: float,
+) -> tuple[Scan, UInt8[np.ndarray, " verts"]]:
+    """Everything in one volume, for a matcher does not know what it sees; the left cameras bring the colours."""
+    lit = SurfaceScene(surfaces, lit=partial(light, rig=rig, shading=config.shading))
+    bare = SurfaceScene(surfaces)
+    volume = DepthFusion(
+        min(surface.voxel_m for surface in surfaces),
+        sum(_area(surface) for surface in surfaces),
+        config=replace(config.fusion, min_weight=config.stereo.min_weight),
+    )
+    for left in range(0, len(rig.names), 2):
+        pair = speckle_pair(bare, rig, left, config=config.stereo, rng=rng)
+        depth = match_pair(pair, config=config.stereo)
+        gain = 1 + config.shading.camera_gain * rng.standard_normal()
+        noise = config.shading.pixel_noise * rng.standard_normal((*depth.shape, 3), dtype=np.float32)
+        colours = np.full((*depth.shape, 3), BACKDROP, np.float32)
+        images = lit.view(rig, left)
+        if images is not None:
+            rows, columns = images.window
+            colours[rows, columns] = np.where((images.surface == NOTHING)[..., None], BACKDROP, images.colours)
+        volume.add(depth, (gain * colours + noise).astype(np.float32), rig.intrinsics[left], rig.T_camera_world[left])
+    mesh, colours = volume.extract()
+    return Scan(mesh, colours, frame_id, time_s), _nearest_labels(surfaces, mesh.vertices)
+
+
+def _area(surface: Surface) -> float:
+    return float(face_areas(surface.mesh.vertices, surface.mesh.faces).sum())
+
+
 def _merge(
     parts: Sequence[tuple[Surface, DepthFusion]], frame_id: int, time_s: float
 ) -> tuple[Scan, UInt8[np.ndarray, " verts"]]:
@@ -88,6 +131,15 @@ def _merge(
         count += len(mesh.vertices)
     mesh = Mesh(np.concatenate(vertices), np.concatenate(faces))
     return Scan(mesh, np.concatenate(colours), frame_id, time_s), np.concatenate(labels)
+
+
+def _nearest_labels(surfaces: Sequence[Surface], points: np.ndarray) -> UInt8[np.ndarray, " points"]:
+    """The labels of the nearest surface."""
+    nearest = nearest_surface([surface.mesh for surface in surfaces], points)
+    labels = np.zeros(len(points), np.uint8)
+    for index, surface in enumerate(surfaces):
+        labels[nearest == index] = _labels(surface, points[nearest == index])
+    return labels
 
 
 def _labels(surface: Surface, points: np.ndarray) -> UInt8[np.ndarray, " points"]:

@@ -9,7 +9,18 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-__all__ = ["FusionConfig", "NoiseConfig", "RigConfig", "ScanConfig", "ScannerConfig", "ShadingConfig"]
+__all__ = [
+    "FusionConfig",
+    "Lighting",
+    "NoiseConfig",
+    "RigConfig",
+    "ScanConfig",
+    "ScannerConfig",
+    "ShadingConfig",
+    "StereoConfig",
+]
+
+Lighting = Literal["even", "side", "two-temperature"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,8 +67,11 @@ class NoiseConfig:
 class ShadingConfig:
     """What light and lens do to the colours."""
 
+    lighting: Lighting = "even"
+    """even: from everywhere, and two weak lamps. side: one near lamp at the subject's left, whose light falls off.
+    two-temperature: a warm lamp at the left, a cool one at the right."""
     ambient: float = 0.72
-    """Share of the light that comes from everywhere; the rest comes from two lamps."""
+    """Under even light, the share that comes from everywhere; the rest comes from two lamps."""
     camera_gain: float = 0.03
     """Standard deviation of each camera's exposure."""
     pixel_noise: float = 0.015
@@ -86,9 +100,54 @@ class FusionConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class StereoConfig:
+    """Active stereo: pods of two cameras with a speckle projector between them, instead of depth cameras."""
+
+    pods: int = 14
+    """How many; they stand where the depth cameras of a rig of this size would."""
+    image_size: int = 768
+    """Width and height of the square images, pixels."""
+    field_of_view_deg: float = 48.0
+    """Full horizontal angle of view."""
+    baseline_m: float = 0.2
+    """Between the two cameras of a pod."""
+    supersampling: int = 2
+    """Rays along each side of a pixel of the speckle images."""
+    speckle_px: float = 0.9
+    """Standard deviation of a speckle's profile, camera pixels."""
+    ambient: float = 0.06
+    """Light that reaches the surface without the pattern, relative to the projector's, head-on at the pod's target."""
+    blur_px: float = 0.6
+    """Standard deviation of the lens's blur."""
+    full_well: float = 9000.0
+    """Electrons of a white pixel; their square root is the shot noise."""
+    read_noise: float = 12.0
+    """Electrons, standard deviation."""
+    block_px: int = 5
+    """Width of the matcher's window."""
+    uniqueness_percent: int = 8
+    """Margin by which the best disparity has to beat the others."""
+    speckle_window_px: int = 150
+    """Smaller islands of disparity are dropped."""
+    refinement_steps: int = 0
+    """Of the matches, on the intensities. Semi-global matching alone is up to 0.3 pixels off, towards whole ones; 4
+    steps leave 0.06."""
+    lost_intensity: float = 0.02
+    """Darker pixels, 1 = full scale, are not matched: background, and what the projector does not reach."""
+    step_m: float = 0.012
+    """Pixels at a larger step of depth are dropped from the cleaned depth; 0 leaves the depth raw."""
+    min_weight: float = 1.0
+    """Pods that must have seen a voxel. Pods overlap little."""
+
+
+@dataclass(frozen=True, slots=True)
 class ScannerConfig:
     """The virtual 4D scanner."""
 
+    sensor: Literal["depth", "stereo"] = "depth"
+    """depth: cameras that measure depth, with modelled noise. stereo: pairs of images under a speckle pattern, matched
+    (slower; fattened silhouettes, flyers and shadows are those of a real matcher)."""
+    stereo: StereoConfig = field(default_factory=StereoConfig)
     rig: RigConfig = field(default_factory=RigConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     shading: ShadingConfig = field(default_factory=ShadingConfig)

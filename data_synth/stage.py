@@ -31,8 +31,9 @@ from capture4d.workdir import Stage, open_stage, run_jobs, write_json, write_npz
 from data_synth.cloth_quality import measure_cloth
 from data_synth.config import FABRICS, SynthConfig
 from data_synth.motions import make_motion
+from data_synth.outfits import OUTFITS, Outfit
 from data_synth.patterns import PanelMesh, Pattern, locate, mesh_pattern, tshirt_pattern
-from data_synth.rig import bounding_sphere, capture_rig
+from data_synth.rig import bounding_sphere, scanner_rig
 from data_synth.scanner import LABEL_BODY, LABEL_GARMENT, Surface, scan_surfaces
 from data_synth.simulation import approach_poses, dress, simulate
 from data_synth.template import bind_template, carry
@@ -41,8 +42,6 @@ from data_synth.wrinkle_relaxation import WrinkleMesh, relax_frame, wrinkle_mesh
 __all__ = ["Take", "prepare_take", "run", "simulate_take", "take_rig", "take_surfaces"]
 
 SCHEMA = 1
-GARMENT_COLOUR, BORDER_COLOUR = (47, 98, 201), (255, 196, 0)
-SUIT_COLOUR, SKIN_COLOUR = (150, 152, 156), (214, 168, 140)
 BORDER_BAND_M = 0.009
 """Width of the painted border."""
 RIG_RADIUS_M = 0.58
@@ -208,6 +207,7 @@ def _simulate(job: _SimulationJob) -> None:
         extent.append((fine.min(axis=0), fine.max(axis=0)))
     rig = take_rig(config, np.array(extent))
     save_rig(folder / "rig.json", rig)
+    outfit = OUTFITS[config.outfit]
     save_body(folder / "body.npz", take.shaped.body)
     save_poses(folder / "poses.npz", _measured_poses(take))
     save_poses(folder / "truth" / "poses.npz", take.poses)
@@ -217,8 +217,8 @@ def _simulate(job: _SimulationJob) -> None:
             config.name,
             take.poses.fps,
             tuple(int(frame_id) for frame_id in take.poses.frame_ids),
-            GARMENT_COLOUR,
-            dict.fromkeys(take.pattern.borders, BORDER_COLOUR),
+            outfit.garment,
+            dict.fromkeys(take.pattern.borders, outfit.border),
         )
     )
     write_json(folder / "cloth" / "complete.json", {"frames": config.frames})
@@ -259,41 +259,34 @@ def _measured_poses(take: Take) -> PoseSequence:
     )
 
 
-def paint_garment(mesh: PanelMesh) -> np.ndarray:
+def paint_garment(mesh: PanelMesh, outfit: Outfit) -> np.ndarray:
     """sRGB per vertex, (V, 3) uint8: the garment's colour, and a painted band along every border of the pattern."""
     border = np.concatenate(list(mesh.loops.values()))
     corners = np.isin(mesh.faces, border)
     painted = KDTree(mesh.uv[corners]).query(mesh.vertex_uv, distance_upper_bound=BORDER_BAND_M)[0] < BORDER_BAND_M
-    return np.where(painted[:, None], BORDER_COLOUR, GARMENT_COLOUR).astype(np.uint8)
+    return np.where(painted[:, None], outfit.border, outfit.garment).astype(np.uint8)
 
 
-def dress_colours(shaped: ShapedBody) -> np.ndarray:
+def dress_colours(shaped: ShapedBody, outfit: Outfit) -> np.ndarray:
     """sRGB per body vertex, (B, 3) uint8: a plain suit; head, hands and feet are bare."""
     regions = shaped.body.regions
     bare = np.zeros(len(shaped.vertices), bool) if regions is None else regions > 0
-    return np.where(bare[:, None], SKIN_COLOUR, SUIT_COLOUR).astype(np.uint8)
+    return np.where(bare[:, None], outfit.skin, outfit.suit).astype(np.uint8)
 
 
 def take_rig(config: SynthConfig, extent: np.ndarray) -> Rig:
     """The rig around a garment whose corners, (..., 3) metres, lie within `extent` all through the clip."""
     centre, radius = bounding_sphere(extent)
-    rig = config.scanner.rig
-    return capture_rig(
-        centre=centre,
-        radius=max(radius, RIG_RADIUS_M),
-        cameras=rig.cameras,
-        image_size=rig.image_size,
-        field_of_view_deg=rig.field_of_view_deg,
-    )
+    return scanner_rig(config.scanner, centre=centre, radius=max(radius, RIG_RADIUS_M))
 
 
 def take_surfaces(take: Take, fine: np.ndarray, surface: np.ndarray) -> list[Surface]:
     """What the scanner sees of a frame: the painted garment, (V, 3), and the body in its suit, (B, 3); float32."""
-    fusion = take.config.scanner.fusion
+    fusion, outfit = take.config.scanner.fusion, OUTFITS[take.config.outfit]
     faces = take.shaped.body.template.faces
     return [
-        Surface(Mesh(fine, take.fine.faces), paint_garment(take.fine), LABEL_GARMENT, fusion.garment_voxel_m),
-        Surface(Mesh(surface, faces), dress_colours(take.shaped), LABEL_BODY, fusion.body_voxel_m),
+        Surface(Mesh(fine, take.fine.faces), paint_garment(take.fine, outfit), LABEL_GARMENT, fusion.garment_voxel_m),
+        Surface(Mesh(surface, faces), dress_colours(take.shaped, outfit), LABEL_BODY, fusion.body_voxel_m),
     ]
 
 

@@ -66,6 +66,13 @@ class Demo(_Stage):
         return 0
 
 
+def _with_sensor(config: Any, sensor: Literal["depth", "stereo"] | None) -> Any:
+    """Settings of a synthetic capture with another scanner, if one is given."""
+    if sensor is None:
+        return config
+    return dataclasses.replace(config, scanner=dataclasses.replace(config.scanner, sensor=sensor))
+
+
 @dataclass(frozen=True, kw_only=True)
 class Synth(_Stage):
     """Simulate a garment on a moving body and scan it: a capture folder with its exact truth."""
@@ -74,12 +81,14 @@ class Synth(_Stage):
     """Capture folder to write."""
     preset: Literal[*synth_config.PRESETS] = "demo"
     """What the settings below start from."""
+    scanner: Literal["depth", "stereo"] | None = None
+    """Short for --scanner.sensor."""
     config: Annotated[synth_config.SynthConfig, arg(name="")] = field(default_factory=synth_config.SynthConfig)
 
     def __call__(self) -> int:
         from data_synth.stage import run
 
-        run(self.output, self.config, workers=self.workers, overwrite=self.overwrite)
+        run(self.output, _with_sensor(self.config, self.scanner), workers=self.workers, overwrite=self.overwrite)
         print(f"capture: {self.output}")
         return 0
 
@@ -94,6 +103,8 @@ class Scan(_Stage):
     """Capture folder to write."""
     template: Path | None = None
     """Mesh to register later: lies on the first mesh, or is the same mesh in another pose."""
+    scanner: Literal["depth", "stereo"] | None = None
+    """Short for --scanner.sensor."""
     config: Annotated[ScanConfig, arg(name="")] = field(default_factory=ScanConfig)
 
     def __call__(self) -> int:
@@ -102,7 +113,7 @@ class Scan(_Stage):
         run(
             self.meshes,
             self.output,
-            self.config,
+            _with_sensor(self.config, self.scanner),
             template=self.template,
             workers=self.workers,
             overwrite=self.overwrite,
@@ -178,11 +189,20 @@ class Extract(_Stage):
     """Capture folder."""
     output: Path
     """Work folder; gets garment/."""
+    learn_colours: bool = False
+    """Learn the colours from the scans even where capture.json gives them; they then say which is which. Without
+    garment_colour in capture.json they are learned anyway."""
 
     def __call__(self) -> int:
         from capture4d.garment_stage import run
 
-        run(self.capture, self.output / "garment", workers=self.workers, overwrite=self.overwrite)
+        run(
+            self.capture,
+            self.output / "garment",
+            learn_colours=self.learn_colours,
+            workers=self.workers,
+            overwrite=self.overwrite,
+        )
         print(f"garment: {self.output / 'garment'}")
         return 0
 

@@ -71,6 +71,16 @@ def test_a_wrong_command_line_is_exit_2(arguments: list[str], capsys: pytest.Cap
     assert "Traceback" not in said.err + said.out
 
 
+def test_the_scanner_is_chosen_in_one_word(monkeypatch: pytest.MonkeyPatch):
+    import data_synth.stage
+
+    seen = []
+    monkeypatch.setattr(data_synth.stage, "run", lambda output, config, **_: seen.append(config.scanner.sensor))
+    for chosen in ((), ("--scanner", "stereo"), ("--scanner.sensor", "stereo")):
+        assert run("synth", "take", "--preset", "tiny", *chosen) == 0
+    assert seen == ["depth", "stereo", "stereo"]
+
+
 def test_a_near_miss_gets_a_hint(capsys: pytest.CaptureFixture[str]):
     run("regster")
     assert "did you mean 'register'?" in capsys.readouterr().err

@@ -53,9 +53,9 @@ def test_border_points_lie_on_the_border(holes: int) -> None:
     top, bottom = found.boundary_loops == 0, found.boundary_loops == 1
     assert top.sum() > 150
     assert bottom.sum() > 120
-    assert np.abs(height[top] - 0.3).mean() < 0.004
-    assert np.abs(height[bottom]).mean() < 0.004
-    assert np.percentile(np.abs(height[bottom]), 95) < 0.007
+    assert np.abs(height[top] - 0.3).mean() < 0.002  # the scan ends here, at the bottom it goes on; samples: 3.4 mm
+    assert np.abs(height[bottom]).mean() < 0.0025
+    assert np.percentile(np.abs(height[bottom]), 95) < 0.006
 
 
 def test_one_paint_cannot_tell_loops_apart() -> None:

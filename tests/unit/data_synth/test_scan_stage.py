@@ -9,6 +9,7 @@ from capture4d.mesh import boundary_loops, face_areas
 from capture4d.mesh_files import write_mesh
 from capture4d.scans import (
     load_garment,
+    load_rig,
     read_capture,
     read_scan,
     read_template,
@@ -19,7 +20,7 @@ from capture4d.types import Mesh
 from data_synth.border_paint import paint_borders
 from data_synth.mesh_sequence import open_sequence
 from data_synth.scan_stage import run
-from data_synth.scanner_config import FusionConfig, RigConfig, ScanConfig, ScannerConfig
+from data_synth.scanner_config import FusionConfig, RigConfig, ScanConfig, ScannerConfig, StereoConfig
 
 BLUE, YELLOW, RED = (47, 98, 201), (255, 210, 0), (229, 51, 42)
 SMALL = ScanConfig(
@@ -182,3 +183,20 @@ def test_cloth_that_hangs_close_to_a_border_stays_unpainted():
     assert painted.any()
     assert inner.any()
     assert not (painted & inner & (height < 3)).any()
+
+
+def test_stereo_pods_scan_a_sequence_too(sequence, tmp_path):
+    scanner = dataclasses.replace(
+        SMALL.scanner,
+        sensor="stereo",
+        stereo=StereoConfig(pods=6, image_size=200, supersampling=1, speckle_window_px=30, baseline_m=0.08),
+    )
+    run(sequence, tmp_path / "take", dataclasses.replace(SMALL, frames=1, scanner=scanner))
+    description = read_capture(tmp_path / "take")
+    assert len(load_rig(tmp_path / "take" / "rig.json").names) == 12
+    (frame_id,) = description.frame_ids
+    scan, truth = read_scan(description, frame_id), read_truth_frame(description, frame_id)
+    assert len(truth.labels) == len(scan.mesh.vertices) > 1000
+    model = read_truth_model(description)
+    error = surface_distances(Mesh(truth.vertices, model.fine.faces), scan.mesh.vertices)
+    assert np.median(error) < 0.002

@@ -1,0 +1,124 @@
+"""What the vertices of a take can be: the colours that capture.json gives, and those learned from its scans.
+
+Learned is what an absent `garment_colour` leaves open, or everything where that is asked for; colours that are given
+then say which of the learned ones is which. A few frames are read, spread over the take.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from capture4d.border_loops import loop_order, name_shirt_loops
+from capture4d.colour_learning import Light, learn_colours
+from capture4d.errors import InputError
+from capture4d.garment_extraction import extract_garment
+from capture4d.scans import Capture, Colour, read_capture, read_scan, read_template
+from capture4d.types import GarmentScan, Scan
+
+__all__ = ["KnownColours", "cut_out", "take_colours"]
+
+FRAMES = 4
+"""Scans that colours are learned from."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KnownColours:
+    """sRGB; where they are learned, as under the mean light of the take."""
+
+    garment: Colour
+    boundary: Mapping[str, Colour]
+    """Paint on each named border."""
+    loop_names: tuple[str, ...]
+    """Of the garment's borders. Where they differ from the names of the paints, no paint tells its loop."""
+    others: tuple[Colour, ...] = ()
+    light: Light | None = None
+    """None: given, not learned."""
+
+    def flat(self, scan: Scan) -> Scan:
+        """A scan in the light that the colours hold for."""
+        return scan if self.light is None else replace(scan, colours=self.light.removed(scan.mesh, scan.colours))
+
+
+def take_colours(capture: Capture, *, learn: bool = False) -> KnownColours:
+    """The colours of a take.
+
+    Args:
+        learn: also where capture.json gives them all.
+    Raises:
+        ColoursNotSeparableError: what is to be learned cannot be.
+        InputError: the first scan cannot be read.
+    """
+    if capture.garment_colour is not None and not learn:
+        return KnownColours(capture.garment_colour, capture.boundary_colours, tuple(capture.boundary_colours))
+    return _learned(capture.path.resolve(), capture.garment_colour, tuple(capture.boundary_colours.items()))
+
+
+@lru_cache(maxsize=1)
+def _learned(path: Path, garment: Colour | None, boundary: tuple[tuple[str, Colour], ...]) -> KnownColours:
+    capture = read_capture(path)
+    paints = tuple(dict.fromkeys(colour for _, colour in boundary))
+    found = learn_colours(_some_scans(capture), garment=garment, paints=paints or None, source=str(path))
+    if boundary:
+        as_seen = dict(zip(paints, found.paints, strict=True))
+        named = {name: as_seen[colour] for name, colour in boundary}
+        return KnownColours(found.garment, named, tuple(named), found.others, found.light)
+    names = _template_loops(capture)
+    if len(found.paints) == 1:
+        named = dict.fromkeys(names or ("border",), found.paints[0])
+    else:
+        named = {f"paint_{index}": paint for index, paint in enumerate(found.paints)}
+    return KnownColours(found.garment, named, names or tuple(named), found.others, found.light)
+
+
+def _some_scans(capture: Capture) -> list[Scan]:
+    """The first scan, and others spread over the take that can be read."""
+    rows = np.unique(np.linspace(0, len(capture.frame_ids) - 1, FRAMES).round().astype(int)).tolist()
+    scans = [read_scan(capture, capture.frame_ids[0])]
+    for row in rows[1:]:
+        try:
+            scans.append(read_scan(capture, capture.frame_ids[row]))
+        except InputError:  # the frame itself will be flagged
+            continue
+    return scans
+
+
+def _template_loops(capture: Capture) -> tuple[str, ...]:
+    try:
+        return tuple(read_template(capture).loops)
+    except InputError:
+        return ()
+
+
+def cut_out(scan: Scan, colours: KnownColours, *, source: str = "scan") -> GarmentScan:
+    """The garment of one scan of the take.
+
+    Raises:
+        ColourNotFoundError: the scan is sound, but the garment or a paint is not in it.
+    """
+    garment = extract_garment(
+        colours.flat(scan), colours.garment, colours.boundary, other_colours=colours.others, source=source
+    )
+    if colours.light is None:
+        return garment
+    if colours.loop_names != garment.loop_names:
+        unknown = np.full(len(garment.boundary_points), -1, np.int32)
+        garment = replace(garment, boundary_loops=unknown, loop_names=colours.loop_names)
+    if (garment.boundary_loops < 0).all():
+        named = name_shirt_loops(garment.boundary_points, garment.loop_names)
+        garment = replace(garment, boundary_loops=named)
+    return _in_order(garment)
+
+
+def _in_order(garment: GarmentScan) -> GarmentScan:
+    """Border points loop by loop, each in order around it; those of no known loop last."""
+    points, loops = garment.boundary_points, garment.boundary_loops
+    parts = [np.flatnonzero(loops == loop) for loop in range(len(garment.loop_names))]
+    parts = [own[loop_order(points[own])] for own in parts if len(own) > 2]
+    known = np.concatenate([*parts, np.zeros(0, np.int64)])
+    order = np.concatenate([known, np.setdiff1d(np.arange(len(points)), known)])
+    return replace(garment, boundary_points=points[order], boundary_loops=loops[order])
