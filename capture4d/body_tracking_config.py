@@ -67,13 +67,13 @@ class ColdStartConfig:
     points: int = 700
     """Points of the scan that the search reads."""
     survivors: int = 6
-    """Starts that are followed up with other arm poses."""
-    finalists: int = 3
+    """Starts that are followed up with other poses of legs and arms."""
+    finalists: int = 4
     """Starts that are fitted in full."""
     rough: Schedule = Schedule(iterations=12, first_scale_m=0.25, last_scale_m=0.06)
     """Of every start."""
-    arms: Schedule = Schedule(iterations=8, first_scale_m=0.12, last_scale_m=0.04)
-    """Of every arm pose tried on a survivor."""
+    limbs: Schedule = Schedule(iterations=8, first_scale_m=0.12, last_scale_m=0.04)
+    """Of every pose of a limb tried on a survivor."""
     full: Schedule = Schedule(iterations=25, first_scale_m=0.08, last_scale_m=0.015)
     """Of the finalists."""
 
@@ -103,6 +103,13 @@ class SequenceConfig:
     """A point of skin or suit is explained by the body if it is this near."""
     check_explained: float = 0.85
     """Frames with a smaller share of explained points are flagged."""
+    check_median_m: float = 0.0025
+    """Frames whose median distance on skin and suit is larger are flagged: a body that faces backwards can lie within
+    12 mm of most points, but not this close. Raise it for scans noisier than that."""
+    outlier_median: float = 2.0
+    """Frames are flagged as well if that distance is so many times what is usual in the take, ..."""
+    least_outlier_m: float = 0.001
+    """... and larger than this."""
     fail_explained: float = 0.6
     """Frames with a smaller share are lost: nothing is built upon them."""
     largest_shape: float = 3.5
