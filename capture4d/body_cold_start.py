@@ -6,8 +6,9 @@ tries other poses of each leg and each arm on those, and fits the winners in ful
 body are from each other, both ways: a scan point that no body explains counts, and so does a body part where nothing
 was scanned.
 
-Until the winners are fitted the shape is the mean one. Free from the start, it bends the back of one person into the
-front of a stranger one, and the right facing loses before its limbs are in place.
+Until the winners are fitted the shape keeps near the mean one. Free from the start, it bends the back of one person
+into the front of a stranger one, and the right facing loses before its limbs are in place. If the winner still leaves
+much unexplained, its limbs are tried once more, now that trunk and shape are known.
 """
 
 from __future__ import annotations
@@ -85,6 +86,8 @@ class _Arm:
 
 
 _Variants = Callable[[BodyState], Iterable[BodyState]]
+_Ranked = tuple[float, BodyState]
+"""Misfit in metres, and the state that has it."""
 
 
 def find_pose(
@@ -95,43 +98,102 @@ def find_pose(
     Returns:
         The best fit, and its mean misfit in metres (see `misfit`).
     """
-    coarse = tracked_body(model.body, samples=COARSE_SAMPLES)
-    stiff = replace(prior, spread=np.where(prior.spread < LIMB_SPREAD, prior.spread / 4, prior.spread))
-    few = subsample(scan, config.points)
-    tree = KDTree(scan.points)
+    search = _Search.create(model, prior, scan, config, fit)
+    starts = _upright_starts(model, scan, search.arms, config.facings)
+    found = search.distinct(search.settle(starts, config.rough), config.survivors)
+    best = search.finish(search.follow_up(found))
+    if best.misfit_m > config.second_round_m:
+        # trunk and shape are mostly right by now, which the limbs of the first round could not know
+        again = search.finish(search.follow_up([(best.misfit_m, best.fit.state)], keep_shape=True))
+        best = min(best, again, key=lambda each: each.cost_m)
+    return best.fit, best.misfit_m
 
-    def settle(starts: Iterable[BodyState], schedule: Schedule) -> list[tuple[float, BodyState]]:
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Finalist:
+    fit: Fit
+    misfit_m: float
+    cost_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Search:
+    """What all steps of one search share."""
+
+    model: TrackedBody
+    coarse: TrackedBody
+    prior: JointPrior
+    stiff: JointPrior
+    scan: ScanPoints
+    few: ScanPoints
+    tree: KDTree
+    config: ColdStartConfig
+    fit: FitConfig
+    cautious: FitConfig
+    """Holds the shape back."""
+    arms: list[_Arm]
+    legs: list[_Leg]
+
+    @staticmethod
+    def create(
+        model: TrackedBody, prior: JointPrior, scan: ScanPoints, config: ColdStartConfig, fit: FitConfig
+    ) -> _Search:
+        return _Search(
+            model,
+            tracked_body(model.body, samples=COARSE_SAMPLES),
+            prior,
+            replace(prior, spread=np.where(prior.spread < LIMB_SPREAD, prior.spread / 4, prior.spread)),
+            scan,
+            subsample(scan, config.points),
+            KDTree(scan.points),
+            config,
+            fit,
+            replace(fit, shape_spread=config.shape_spread),
+            _arms(model.body, prior),
+            _legs(model.body, prior),
+        )
+
+    def settle(self, starts: Iterable[BodyState], schedule: Schedule, *, keep_shape: bool = False) -> list[_Ranked]:
+        """Fit every start to a few points; the best first."""
         fits = [
-            fit_body(coarse, stiff, few, start, schedule=schedule, config=fit, fixed_shape=True).state
+            fit_body(
+                self.coarse, self.stiff, self.few, start,
+                schedule=schedule, config=self.cautious, fixed_shape=keep_shape,
+            ).state
             for start in starts
-        ]
-        return _ranked((misfit(coarse, few, tree, state), state) for state in fits)
+        ]  # fmt: skip
+        return _ranked((misfit(self.coarse, self.few, self.tree, state), state) for state in fits)
 
-    def follow_up(found: list[tuple[float, BodyState]], variants: _Variants) -> list[tuple[float, BodyState]]:
-        settled = settle((variant for _, state in found for variant in variants(state)), config.limbs)
-        return _distinct(coarse, _ranked([*found, *settled]), max(config.survivors - 2, config.finalists))
+    def distinct(self, ranked: list[_Ranked], count: int) -> list[_Ranked]:
+        return _distinct(self.model.body, ranked, count)
 
-    arms, legs = _arms(model.body, prior), _legs(model.body, prior)
-    found = _distinct(
-        coarse, settle(_upright_starts(model, scan, arms, config.facings), config.rough), config.survivors
-    )
-    if legs:
-        found = follow_up(found, partial(_legs_apart, legs))
-    for leg in legs:
-        found = follow_up(found, partial(_leg_variants, leg))
-    for arm in arms:
-        found = follow_up(found, partial(_arm_variants, arm))
-    fits = [
-        fit_body(model, prior, scan, state, schedule=config.full, config=fit)
-        for _, state in _distinct(coarse, found, config.finalists)
-    ]
-    misfits = [misfit(model, scan, tree, each.state) for each in fits]
-    costs = [far + MEDIAN_COST * _median_distance(each, scan) for far, each in zip(misfits, fits, strict=True)]
-    best = int(np.argmin(costs))
-    return fits[best], misfits[best]
+    def follow_up(self, found: list[_Ranked], *, keep_shape: bool = False) -> list[_Ranked]:
+        """Try other poses of one limb after the other."""
+        variants: list[_Variants] = [partial(_legs_apart, self.legs)] if self.legs else []
+        variants += [partial(_leg_variants, leg) for leg in self.legs]
+        variants += [partial(_arm_variants, arm) for arm in self.arms]
+        for vary in variants:
+            tried = (variant for _, state in found for variant in vary(state))
+            settled = self.settle(tried, self.config.limbs, keep_shape=keep_shape)
+            count = max(self.config.survivors - 2, self.config.finalists)
+            found = self.distinct(_ranked([*found, *settled]), count)
+        return found
+
+    def finish(self, found: list[_Ranked]) -> _Finalist:
+        """Fit the best few to all points, the shape held back at first; the best of them."""
+        finalists = []
+        for _, start in self.distinct(found, self.config.finalists):
+            settled = self._full(start, self.config.settle, self.cautious).state
+            fit = self._full(settled, self.config.full, self.fit)
+            far = misfit(self.model, self.scan, self.tree, fit.state)
+            finalists.append(_Finalist(fit, far, far + MEDIAN_COST * _median_distance(fit, self.scan)))
+        return min(finalists, key=lambda each: each.cost_m)
+
+    def _full(self, start: BodyState, schedule: Schedule, config: FitConfig) -> Fit:
+        return fit_body(self.model, self.prior, self.scan, start, schedule=schedule, config=config)
 
 
-def _ranked(found: Iterable[tuple[float, BodyState]]) -> list[tuple[float, BodyState]]:
+def _ranked(found: Iterable[_Ranked]) -> list[_Ranked]:
     return sorted(found, key=lambda each: each[0])
 
 
@@ -250,16 +312,16 @@ def _above(body: Body, joint: int) -> int:
     return above
 
 
-def _distinct(model: TrackedBody, ranked: list[tuple[float, BodyState]], count: int) -> list[tuple[float, BodyState]]:
+def _distinct(body: Body, ranked: list[_Ranked], count: int) -> list[_Ranked]:
     """The best few that differ from each other.
 
     A third of the places is for bodies that face away from the best one: front and back look much alike from afar.
     """
-    kept: list[tuple[float, BodyState]] = []
+    kept: list[_Ranked] = []
     places: list[np.ndarray] = []
     away = 0
     for score, state in ranked:
-        centres = _centres(model.body, state)
+        centres = _centres(body, state)
         if not all(np.linalg.norm(centres - other, axis=1).max() > DISTINCT_M for other in places):
             continue
         opposed = bool(kept) and float(state.rotations[0, :, 2] @ kept[0][1].rotations[0, :, 2]) < 0

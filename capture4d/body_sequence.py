@@ -215,6 +215,9 @@ def judge(
         reasons.append(f"the body explains {100 * explained:.0f} % of skin and suit")
     if median > config.check_median_m:
         reasons.append(f"skin and suit lie {1e3 * median:.1f} mm from the body in the median")
+    far = float((np.isnan(bare) | (np.abs(bare) > config.far_m)).mean())
+    if far > config.check_far:
+        reasons.append(f"{100 * far:.0f} % of skin and suit are far from the body")
     if inside > 1 - config.check_explained:
         reasons.append(f"{100 * inside:.0f} % of the garment lies inside the body")
     return Quality(tuple(reasons), explained < config.fail_explained, explained, median, inside)
