@@ -184,12 +184,7 @@ def _bare(body: Body) -> np.ndarray:
 
 
 def _joint_errors_mm(found: PosedBody, true: PosedBody) -> np.ndarray:
-    return 1e3 * np.linalg.norm(_centres(found) - _centres(true), axis=1)
-
-
-def _centres(posed: PosedBody) -> np.ndarray:
-    turn, shift = posed.transforms[:, :3, :3], posed.transforms[:, :3, 3]
-    return np.einsum("jab,jb->ja", turn, posed.shaped.joints) + shift
+    return 1e3 * np.linalg.norm(found.joint_centres() - true.joint_centres(), axis=1)
 
 
 # --- cold starts -------------------------------------------------------------------------------------------------
@@ -356,4 +351,4 @@ def _register(capture: Path, work: Path, *, tracked: bool) -> dict[str, float]:
 def _shown(capture: Capture, person: ShapedBody, truth: PoseSequence, row: int) -> np.ndarray:
     """Joints near which there is anything of the scan."""
     tree = KDTree(read_scan(capture, int(truth.frame_ids[row])).mesh.vertices[::20])
-    return tree.query(_centres(pose_frame(person, truth, row)))[0] < SHOWN_M
+    return tree.query(pose_frame(person, truth, row).joint_centres())[0] < SHOWN_M

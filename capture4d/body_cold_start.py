@@ -337,5 +337,4 @@ def _distinct(body: Body, ranked: list[_Ranked], count: int) -> list[_Ranked]:
 
 def _centres(body: Body, state: BodyState) -> Float64[np.ndarray, "joints 3"]:
     """World joint positions."""
-    posed = with_pose(with_shape(body, state.shape), state.rotations, state.translation)
-    return np.einsum("jab,jb->ja", posed.transforms[:, :3, :3], posed.shaped.joints) + posed.transforms[:, :3, 3]
+    return with_pose(with_shape(body, state.shape), state.rotations, state.translation).joint_centres()
