@@ -18,7 +18,7 @@ from capture4d.mesh import vertex_adjacency
 from capture4d.open3d_loading import import_open3d
 from capture4d.types import Body, Garment
 
-__all__ = ["bind", "diffuse", "with_body_shape"]
+__all__ = ["WEIGHT_SMOOTHING", "bind", "diffuse", "with_body_shape"]
 
 WEIGHT_SMOOTHING = 12
 """Diffusion steps on the skin weights: nearest body points jump from trunk to arm under a sleeve."""

@@ -16,9 +16,10 @@ import numpy as np
 from jaxtyping import Float64, Int32
 
 from capture4d.body import PosedBody, unskin
+from capture4d.body_tracking_jacobian import PosedSurface, match, tracked_body
 from capture4d.errors import InputError
-from capture4d.garment_binding import bind
-from capture4d.mesh import boundary_loops, unique_edges
+from capture4d.garment_binding import WEIGHT_SMOOTHING, diffuse
+from capture4d.mesh import boundary_loops, unique_edges, vertex_normals
 from capture4d.types import Body, Garment, Mesh
 from capture4d.uv_atlas import UvReport, check_uv, fresh_uv
 
@@ -27,6 +28,8 @@ __all__ = ["TemplateReport", "UvChoice", "make_template", "name_loops", "weld"]
 UvChoice = Literal["auto", "keep", "fresh", "none"]
 FAR_M = 0.25
 """A garment whose vertices lie farther than this from the body, in the median, is not on it."""
+NORMAL_WEIGHT = 4.0
+"""How much more facing counts than in tracking: loose cloth hangs centimetres away from its limb."""
 ARM = r"upperarm|lowerarm|wrist|elbow|_shoulder|_hand"
 LEG = r"upperleg|lowerleg|foot|knee|ankle|_hip"
 NECK = r"neck|head"
@@ -59,9 +62,7 @@ def make_template(
         InputError: the mesh cannot be a template; says what was expected.
     """
     _require_surface(mesh, source)
-    at, barycentric, weights = bind(mesh.vertices, mesh.faces, body)
-    corners = body.vertices()[body.shaped.body.template.faces[at]]
-    nearest = np.einsum("vk,vkc->vc", barycentric, corners)
+    at, barycentric, weights, nearest = _bind(mesh, body)
     distance = float(np.median(np.linalg.norm(mesh.vertices - nearest, axis=1)))
     if distance > FAR_M:
         raise InputError(
@@ -79,10 +80,31 @@ def make_template(
         loops=dict(zip(_loop_names(loops, names, weights, rest, body.shaped.body, source), loops, strict=True)),
         embedding_faces=at,
         embedding_barycentric=barycentric,
-        skin_weights=weights.astype(np.float32),
+        skin_weights=weights,
         body_shape=np.asarray(body.shaped.shape, np.float32),
     )
     return garment, TemplateReport(len(mesh.vertices), len(mesh.faces), distance, found, fresh)
+
+
+def _bind(mesh: Mesh, body: PosedBody) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Body faces and barycentrics, skin weights, and the body points themselves.
+
+    Only body points that face the same way count as near: the inside of a sleeve hangs nearer to the trunk than to the
+    arm. Which way the garment faces is what most of it agrees on with the body.
+    """
+    model = tracked_body(body.shaped.body)
+    faces, skin = body.shaped.body.template.faces, body.vertices()
+    surface = PosedSurface(model, body, skin, vertex_normals(skin, faces))
+    vertices = mesh.vertices.astype(np.float64)
+    normals = vertex_normals(vertices, mesh.faces)
+    plain = match(surface, vertices, np.zeros_like(normals))
+    if np.einsum("va,va->v", plain.normals, normals).sum() < 0:
+        normals = -normals
+    matches = match(surface, vertices, NORMAL_WEIGHT * normals)
+    weights = np.einsum("vk,vkj->vj", matches.barycentric, body.shaped.body.skin_weights[faces[matches.faces]])
+    weights = diffuse(weights, mesh.faces, WEIGHT_SMOOTHING)
+    weights = (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
+    return matches.faces, matches.barycentric.astype(np.float32), weights, matches.points
 
 
 def weld(mesh: Mesh) -> Mesh:

@@ -39,7 +39,7 @@ BODY = (226, 142, 84)
 LABELS = np.array([(196, 192, 186), (84, 132, 214), (250, 206, 60)], np.uint8)
 """Colours of what was cut apart: body, garment, paint."""
 LOOPS = ((214, 62, 62), (46, 150, 84), (150, 70, 190), (20, 150, 180), (230, 120, 20), (120, 90, 60))
-POINT_M = 0.004
+POINT_M = 0.006
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -198,21 +198,27 @@ def _draw_row(work: Path, capture: Capture, loops: Mapping[int, list[np.ndarray]
     paints = tuple(dict.fromkeys(capture.boundary_colours.values()))
     labels = settle_labels(scan.mesh.faces, classify_colours(scan.colours, capture.garment_colour, paints))
     painted = LABELS[np.minimum(labels, 2)]
-    x, y, z = np.ptp(scan.mesh.vertices, axis=0).tolist()
-    framing = Framing((x, y, z))
+    cloth = scan.mesh.vertices[labels > 0] if (labels > 0).any() else scan.mesh.vertices
     borders = _border_dots(work / "garment" / "frames" / f"{frame_id:06d}.npz", frame_id, loops[row])
     tracked = _tracked_body(work / "body", frame_id)
     extraction, tracking = [], []
     for direction in VIEWS:
-        view = framing.view(scan.mesh.vertices, direction)
+        view = _framing(cloth).view(cloth, direction)
         scanned = render([Drawn(scan.mesh, scan.colours)], view, width=WIDTH, height=HEIGHT)
         cut = render([Drawn(scan.mesh, painted), *borders], view, width=WIDTH, height=HEIGHT)
         extraction += [Panel("scan", data_uri(scanned)), Panel("garment, paint and border points", data_uri(cut))]
         if tracked is not None:
+            view = _framing(scan.mesh.vertices).view(scan.mesh.vertices, direction)
+            scanned = render([Drawn(scan.mesh, scan.colours)], view, width=WIDTH, height=HEIGHT)
             body = render([Drawn(tracked, BODY)], view, width=WIDTH, height=HEIGHT)
             mixed = (0.45 * scanned + 0.55 * body + 0.5).astype(np.uint8)
             tracking += [Panel("tracked body", data_uri(body)), Panel("in the scan", data_uri(mixed))]
     return StagePictures(row, extraction, tracking)
+
+
+def _framing(vertices: np.ndarray) -> Framing:
+    x, y, z = np.ptp(vertices, axis=0).tolist()
+    return Framing((x, y, z))
 
 
 def _tracked_body(folder: Path, frame_id: int) -> Mesh | None:
