@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float64, Int32
+from jaxtyping import Float32, Float64, Int32
 
 from capture4d.body import PosedBody, unskin
 from capture4d.body_tracking_jacobian import PosedSurface, match, tracked_body
@@ -164,7 +164,7 @@ def _loop_names(
 
 def name_loops(
     loops: Sequence[Int32[np.ndarray, " _"]],
-    weights: Float64[np.ndarray, "verts joints"],
+    weights: Float32[np.ndarray, "verts joints"],
     rest: Float64[np.ndarray, "verts 3"],
     body: Body,
 ) -> tuple[str, ...]:
