@@ -5,6 +5,7 @@ Three kinds of data, of bodies whose shape the tracker does not know:
     takes    a range-of-motion clip and a CMU clip (`shared/data/mocap` beside the project; a scripted clip without it),
              in a shell of cloth, points sampled with noise and holes: quick to make, so many frames
     scanner  a few frames of the same, seen by the virtual cameras and tracked as a capture, from files
+    motions  every BVH clip beside that one (a scripted clip without any), out and in again in all formats
     cloth    a simulated T-shirt from the synthetic scanner, with registration by tracked and by true poses
 
 The tracker's body is the one that the scans are of, skinned as the tracker skins it. Real people are neither: the
@@ -14,7 +15,8 @@ Joints that count: root, spine, neck, head, clavicles, shoulders, elbows, wrists
 whose cameras look at the upper body, those with scan points within 12 cm.
 
 Limits this was built against: joint_mean_mm 5 and joint_p99_mm 20 over 200 frames, cold_start_right 38 of 40,
-skin_mean_mm 3, warm_cpu_s 0.5, registration with tracked poses at most 1.15 times that with true ones.
+skin_mean_mm 3, warm_cpu_s 0.5, motion_round_trip_mm 1, registration with tracked poses at most 1.15 times that with
+true ones.
 """
 
 from __future__ import annotations
@@ -40,6 +42,7 @@ from capture4d.body_stage import run as track
 from capture4d.body_tracking_config import TrackingConfig
 from capture4d.bvh_format import read_bvh
 from capture4d.garment_stage import run as extract
+from capture4d.motion_files import read_motion, write_motion
 from capture4d.motion_retarget import retarget
 from capture4d.records import load_poses, save_body
 from capture4d.scans import Capture, read_capture, read_scan, save_poses, write_capture_description, write_scan
@@ -99,6 +102,7 @@ def run(
     console.print("\n".join(f"{metric.key} {metric.value:.3f}" for metric in metrics))
     metrics += _cold_starts(tracker, cold_starts, np.random.default_rng([seed, 10]), console)
     with tempfile.TemporaryDirectory(prefix="capture4d-tracking-") as scratch:
+        metrics += _round_trips(body, mocap, Path(scratch), quick=quick)
         metrics += _scanner(body, scanned, Path(scratch), mocap, seed)
         if cloth:
             metrics += _cloth(capture or _simulated(quick), Path(scratch))
@@ -220,6 +224,37 @@ def _random_person(body: Body, rng: np.random.Generator) -> PosedBody:
         leg = body.joint_names.index(f"upperleg01.{side}")
         rotations[leg] = Rotation.from_rotvec(rng.normal(0, 0.15, 3)).as_matrix()
     return with_pose(person, rotations, rng.uniform(-0.3, 0.3, 3) * (1.0, 0.1, 1.0))
+
+
+# --- motion files ------------------------------------------------------------------------------------------------
+
+
+def _round_trips(body: Body, mocap: Path, scratch: Path, *, quick: bool) -> list[Metric]:
+    """Joint positions of clips after BVH, npz and AMASS npz; and from AMASS's own arrays, as other readers see them."""
+    clips = [read_motion(path, body, fps=60.0) for path in sorted(mocap.parent.glob("*.bvh"))]
+    if not clips:
+        clips = [replace(poses, shape=np.zeros(0, np.float32)) for _, poses in _motions(body, 30, mocap)]
+    worst, plain = 0.0, 0.0
+    for poses in clips[:1] if quick else clips:
+        places = _joint_places(body, poses)
+        for name, amass in (("clip.bvh", False), ("clip.npz", False), ("amass.npz", True)):
+            write_motion(scratch / name, body, poses, amass=amass)
+            worst = max(worst, _farthest_mm(places, _joint_places(body, read_motion(scratch / name, body))))
+        with np.load(scratch / "amass.npz") as arrays:
+            kept = {name: arrays[name] for name in arrays.files if not name.startswith("capture4d_")}
+        np.savez(scratch / "plain.npz", **kept)
+        seen = read_motion(scratch / "plain.npz", body)
+        plain = max(plain, _farthest_mm(places, _joint_places(body, seen)))
+    return [Metric("motion_round_trip_mm", worst, "mm"), Metric("amass_alone_mm", plain, "mm")]
+
+
+def _joint_places(body: Body, poses: PoseSequence) -> np.ndarray:
+    person = with_shape(body, poses.shape)
+    return np.stack([pose_frame(person, poses, t).joint_centres() for t in range(len(poses.frame_ids))])
+
+
+def _farthest_mm(here: np.ndarray, there: np.ndarray) -> float:
+    return 1e3 * float(np.linalg.norm(here - there, axis=2).max())
 
 
 # --- through the cameras -----------------------------------------------------------------------------------------
