@@ -12,7 +12,8 @@ The tracker's body is the one that the scans are of, skinned as the tracker skin
 figures are lower bounds.
 
 Joints that count: root, spine, neck, head, clavicles, shoulders, elbows, wrists, hips, knees and ankles; in `cloth`,
-whose cameras look at the upper body, those with scan points within 12 cm.
+whose cameras look at the upper body, those with scan points within 12 cm; in `scanner`, whose coarse scans lack hands,
+and now and then a whole arm, those whose own part of the body was scanned.
 
 Limits this was built against: joint_mean_mm 5 and joint_p99_mm 20 over 200 frames, cold_start_right 38 of 40,
 skin_mean_mm 3, warm_cpu_s 0.5, motion_round_trip_mm 1, registration with tracked poses at most 1.15 times that with
@@ -44,7 +45,7 @@ from capture4d.bvh_format import read_bvh
 from capture4d.garment_stage import run as extract
 from capture4d.motion_files import read_motion, write_motion
 from capture4d.motion_retarget import retarget
-from capture4d.records import load_poses, save_body
+from capture4d.records import ArrayFile, load_poses, save_body
 from capture4d.scans import Capture, read_capture, read_scan, save_poses, write_capture_description, write_scan
 from capture4d.types import Body, PoseSequence
 from capture4d.workdir import read_json
@@ -294,13 +295,21 @@ def _scanner(body: Body, frames: int, scratch: Path, mocap: Path, seed: int) -> 
         translations=truth.translations[rows],
         frame_ids=np.array(capture.frame_ids, np.int32),
     )
-    errors = _sequence_errors_mm(body, poses, seen)[:, _counted(body)]
+    scanned = np.stack([_scanned_joints(scratch / "scanned-body", frame_id) for frame_id in capture.frame_ids])
+    errors = _sequence_errors_mm(body, poses, seen)[_counted(body) & scanned]
     skin = with_shape(body, poses.shape).vertices - person.vertices
     return [
+        Metric("scanner_joints_seen_percent", 100 * float(scanned[:, _counted(body)].mean()), "%", "higher"),
         Metric("scanner_joint_mean_mm", float(errors.mean()), "mm"),
         Metric("scanner_joint_p99_mm", float(np.percentile(errors, 99)), "mm"),
         Metric("scanner_skin_mean_mm", 1e3 * float(np.linalg.norm(skin[_bare(body)], axis=1).mean()), "mm"),
     ]
+
+
+def _scanned_joints(folder: Path, frame_id: int) -> np.ndarray:
+    """Joints whose own part of the body has scan points; the others follow their prior, which no scan can mend."""
+    with ArrayFile(folder / "refined" / f"{frame_id:06d}.npz") as arrays:
+        return arrays["seen"]
 
 
 def _shift(by: np.ndarray) -> np.ndarray:
