@@ -5,16 +5,19 @@ Three kinds of data, of bodies whose shape the tracker does not know:
     takes    a range-of-motion clip and a CMU clip (`shared/data/mocap` beside the project; a scripted clip without it),
              in a shell of cloth, points sampled with noise and holes: quick to make, so many frames
     scanner  a few frames of the same, seen by the virtual cameras and tracked as a capture, from files
+    motions  every BVH clip beside that one (a scripted clip without any), out and in again in all formats
     cloth    a simulated T-shirt from the synthetic scanner, with registration by tracked and by true poses
 
 The tracker's body is the one that the scans are of, skinned as the tracker skins it. Real people are neither: the
 figures are lower bounds.
 
 Joints that count: root, spine, neck, head, clavicles, shoulders, elbows, wrists, hips, knees and ankles; in `cloth`,
-whose cameras look at the upper body, those with scan points within 12 cm.
+whose cameras look at the upper body, those with scan points within 12 cm; in `scanner`, whose coarse scans lack hands,
+and now and then a whole arm, those whose own part of the body was scanned.
 
 Limits this was built against: joint_mean_mm 5 and joint_p99_mm 20 over 200 frames, cold_start_right 38 of 40,
-skin_mean_mm 3, warm_cpu_s 0.5, registration with tracked poses at most 1.15 times that with true ones.
+skin_mean_mm 3, warm_cpu_s 0.5, motion_round_trip_mm 1, registration with tracked poses at most 1.15 times that with
+true ones.
 """
 
 from __future__ import annotations
@@ -40,8 +43,9 @@ from capture4d.body_stage import run as track
 from capture4d.body_tracking_config import TrackingConfig
 from capture4d.bvh_format import read_bvh
 from capture4d.garment_stage import run as extract
+from capture4d.motion_files import read_motion, write_motion
 from capture4d.motion_retarget import retarget
-from capture4d.records import load_poses, save_body
+from capture4d.records import ArrayFile, load_poses, save_body
 from capture4d.scans import Capture, read_capture, read_scan, save_poses, write_capture_description, write_scan
 from capture4d.types import Body, PoseSequence
 from capture4d.workdir import read_json
@@ -99,6 +103,7 @@ def run(
     console.print("\n".join(f"{metric.key} {metric.value:.3f}" for metric in metrics))
     metrics += _cold_starts(tracker, cold_starts, np.random.default_rng([seed, 10]), console)
     with tempfile.TemporaryDirectory(prefix="capture4d-tracking-") as scratch:
+        metrics += _round_trips(body, mocap, Path(scratch), quick=quick)
         metrics += _scanner(body, scanned, Path(scratch), mocap, seed)
         if cloth:
             metrics += _cloth(capture or _simulated(quick), Path(scratch))
@@ -184,12 +189,7 @@ def _bare(body: Body) -> np.ndarray:
 
 
 def _joint_errors_mm(found: PosedBody, true: PosedBody) -> np.ndarray:
-    return 1e3 * np.linalg.norm(_centres(found) - _centres(true), axis=1)
-
-
-def _centres(posed: PosedBody) -> np.ndarray:
-    turn, shift = posed.transforms[:, :3, :3], posed.transforms[:, :3, 3]
-    return np.einsum("jab,jb->ja", turn, posed.shaped.joints) + shift
+    return 1e3 * np.linalg.norm(found.joint_centres() - true.joint_centres(), axis=1)
 
 
 # --- cold starts -------------------------------------------------------------------------------------------------
@@ -225,6 +225,37 @@ def _random_person(body: Body, rng: np.random.Generator) -> PosedBody:
         leg = body.joint_names.index(f"upperleg01.{side}")
         rotations[leg] = Rotation.from_rotvec(rng.normal(0, 0.15, 3)).as_matrix()
     return with_pose(person, rotations, rng.uniform(-0.3, 0.3, 3) * (1.0, 0.1, 1.0))
+
+
+# --- motion files ------------------------------------------------------------------------------------------------
+
+
+def _round_trips(body: Body, mocap: Path, scratch: Path, *, quick: bool) -> list[Metric]:
+    """Joint positions of clips after BVH, npz and AMASS npz; and from AMASS's own arrays, as other readers see them."""
+    clips = [read_motion(path, body, fps=60.0) for path in sorted(mocap.parent.glob("*.bvh"))]
+    if not clips:
+        clips = [replace(poses, shape=np.zeros(0, np.float32)) for _, poses in _motions(body, 30, mocap)]
+    worst, plain = 0.0, 0.0
+    for poses in clips[:1] if quick else clips:
+        places = _joint_places(body, poses)
+        for name, amass in (("clip.bvh", False), ("clip.npz", False), ("amass.npz", True)):
+            write_motion(scratch / name, body, poses, amass=amass)
+            worst = max(worst, _farthest_mm(places, _joint_places(body, read_motion(scratch / name, body))))
+        with np.load(scratch / "amass.npz") as arrays:
+            kept = {name: arrays[name] for name in arrays.files if not name.startswith("capture4d_")}
+        np.savez(scratch / "plain.npz", **kept)
+        seen = read_motion(scratch / "plain.npz", body)
+        plain = max(plain, _farthest_mm(places, _joint_places(body, seen)))
+    return [Metric("motion_round_trip_mm", worst, "mm"), Metric("amass_alone_mm", plain, "mm")]
+
+
+def _joint_places(body: Body, poses: PoseSequence) -> np.ndarray:
+    person = with_shape(body, poses.shape)
+    return np.stack([pose_frame(person, poses, t).joint_centres() for t in range(len(poses.frame_ids))])
+
+
+def _farthest_mm(here: np.ndarray, there: np.ndarray) -> float:
+    return 1e3 * float(np.linalg.norm(here - there, axis=2).max())
 
 
 # --- through the cameras -----------------------------------------------------------------------------------------
@@ -264,13 +295,21 @@ def _scanner(body: Body, frames: int, scratch: Path, mocap: Path, seed: int) -> 
         translations=truth.translations[rows],
         frame_ids=np.array(capture.frame_ids, np.int32),
     )
-    errors = _sequence_errors_mm(body, poses, seen)[:, _counted(body)]
+    scanned = np.stack([_scanned_joints(scratch / "scanned-body", frame_id) for frame_id in capture.frame_ids])
+    errors = _sequence_errors_mm(body, poses, seen)[_counted(body) & scanned]
     skin = with_shape(body, poses.shape).vertices - person.vertices
     return [
+        Metric("scanner_joints_seen_percent", 100 * float(scanned[:, _counted(body)].mean()), "%", "higher"),
         Metric("scanner_joint_mean_mm", float(errors.mean()), "mm"),
         Metric("scanner_joint_p99_mm", float(np.percentile(errors, 99)), "mm"),
         Metric("scanner_skin_mean_mm", 1e3 * float(np.linalg.norm(skin[_bare(body)], axis=1).mean()), "mm"),
     ]
+
+
+def _scanned_joints(folder: Path, frame_id: int) -> np.ndarray:
+    """Joints whose own part of the body has scan points; the others follow their prior, which no scan can mend."""
+    with ArrayFile(folder / "refined" / f"{frame_id:06d}.npz") as arrays:
+        return arrays["seen"]
 
 
 def _shift(by: np.ndarray) -> np.ndarray:
@@ -356,4 +395,4 @@ def _register(capture: Path, work: Path, *, tracked: bool) -> dict[str, float]:
 def _shown(capture: Capture, person: ShapedBody, truth: PoseSequence, row: int) -> np.ndarray:
     """Joints near which there is anything of the scan."""
     tree = KDTree(read_scan(capture, int(truth.frame_ids[row])).mesh.vertices[::20])
-    return tree.query(_centres(pose_frame(person, truth, row)))[0] < SHOWN_M
+    return tree.query(pose_frame(person, truth, row).joint_centres())[0] < SHOWN_M

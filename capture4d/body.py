@@ -68,6 +68,10 @@ class PosedBody:
             rest = rest + np.tensordot(feature, body.pose_directions, axes=1)
         return skin(rest, body.skin_weights, self.transforms)
 
+    def joint_centres(self) -> Float64[np.ndarray, "joints 3"]:
+        """Where the joints are, metres, world frame."""
+        return np.einsum("jab,jb->ja", self.transforms[:, :3, :3], self.shaped.joints) + self.transforms[:, :3, 3]
+
 
 def with_shape(body: Body, shape: Float[np.ndarray, " shapes"]) -> ShapedBody:
     """Rest vertices and joints of a person.

@@ -25,7 +25,7 @@ from capture4d.body_tracking_config import Schedule, SequenceConfig, TrackingCon
 from capture4d.body_tracking_jacobian import BodyState, TrackedBody, match, pose_surface, tracked_body
 from capture4d.types import Body
 
-__all__ = ["Followed", "Quality", "Refined", "Tracker", "between"]
+__all__ = ["Followed", "Quality", "Refined", "Tracker", "between", "judge", "outlying"]
 
 SEEN_POINTS = 8
 """A joint is seen if so many explained points lie on what it moves itself."""
@@ -213,9 +213,28 @@ def judge(
     reasons = []
     if explained < config.check_explained:
         reasons.append(f"the body explains {100 * explained:.0f} % of skin and suit")
+    if median > config.check_median_m:
+        reasons.append(f"skin and suit lie {1e3 * median:.1f} mm from the body in the median")
+    far = float((np.isnan(bare) | (np.abs(bare) > config.far_m)).mean())
+    if far > config.check_far:
+        reasons.append(f"{100 * far:.0f} % of skin and suit are far from the body")
     if inside > 1 - config.check_explained:
         reasons.append(f"{100 * inside:.0f} % of the garment lies inside the body")
     return Quality(tuple(reasons), explained < config.fail_explained, explained, median, inside)
+
+
+def outlying(
+    medians_m: Float64[np.ndarray, " frames"], config: SequenceConfig
+) -> tuple[float, Bool[np.ndarray, " frames"]]:
+    """Frames that lie farther from the body than the take's noise explains.
+
+    Args:
+        medians_m: distance on skin and suit in every frame, NaN for frames without.
+    Returns:
+        What is usual in the take, metres, and which frames exceed it.
+    """
+    usual = float(np.nanmedian(medians_m)) if np.isfinite(medians_m).any() else 0.0
+    return usual, medians_m > max(config.outlier_median * usual, config.least_outlier_m)
 
 
 def between(first: BodyState, second: BodyState, share: float) -> BodyState:

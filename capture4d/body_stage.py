@@ -14,17 +14,18 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from capture4d.body_anny import load_anny
-from capture4d.body_sequence import Followed, Quality, Refined, Tracker, between
+from capture4d.body_sequence import Followed, Quality, Refined, Tracker, between, outlying
 from capture4d.body_tracking import ScanPoints
-from capture4d.body_tracking_config import TrackingConfig
+from capture4d.body_tracking_config import SequenceConfig, TrackingConfig
 from capture4d.body_tracking_jacobian import BodyState
 from capture4d.errors import InputError
 from capture4d.motion_files import read_motion
@@ -47,7 +48,7 @@ from capture4d.workdir import (
 
 __all__ = ["load_tracking", "run", "tracking_digest"]
 
-SCHEMA = 1
+SCHEMA = 2
 STARTS = ("search", "rest")
 
 
@@ -83,7 +84,7 @@ def run(capture: Path, output: Path, config: TrackingConfig, *, workers: int = 1
     ]
     for _ in run_jobs(_refine_frame, jobs, workers=workers, label="refine poses"):
         pass
-    return _collect(description, stage, shape)
+    return _collect(description, stage, config, shape)
 
 
 def tracking_digest(folder: Path, capture: Path) -> str:
@@ -290,7 +291,21 @@ def _save_refined(stage: Stage, frame_id: int, first: Followed, refined: Refined
     )
 
 
-def _collect(capture: Capture, stage: Stage, shape: tuple[float, ...]) -> str:
+def _with_outliers(records: Sequence[dict[str, Any]], config: SequenceConfig) -> list[dict[str, Any]]:
+    """The frames' records, flagged where only the whole take shows that something is wrong."""
+    medians = np.array([np.nan if record["median_m"] is None else record["median_m"] for record in records], np.float64)
+    usual, outliers = outlying(medians, config)
+    flagged = []
+    for record, median, is_outlier in zip(records, medians, outliers, strict=True):
+        if is_outlier:
+            reason = f"skin and suit lie {1e3 * median:.1f} mm from the body, {1e3 * usual:.1f} is usual in this take"
+            verdict = "lost" if record["verdict"] == "lost" else "check"
+            record = {**record, "verdict": verdict, "reasons": [*record["reasons"], reason]}
+        flagged.append(record)
+    return flagged
+
+
+def _collect(capture: Capture, stage: Stage, config: TrackingConfig, shape: tuple[float, ...]) -> str:
     """Gather the frames, close the stage."""
     paths = [stage.frame_path(frame_id, folder="refined") for frame_id in capture.frame_ids]
     rotations, translations = [], []
@@ -310,8 +325,7 @@ def _collect(capture: Capture, stage: Stage, shape: tuple[float, ...]) -> str:
             names,
         ),
     )
-    lines = [
-        json.dumps(read_json(stage.frame_path(frame_id, ".json", folder="metrics"))) for frame_id in capture.frame_ids
-    ]
+    records = [read_json(stage.frame_path(frame_id, ".json", folder="metrics")) for frame_id in capture.frame_ids]
+    lines = [json.dumps(record) for record in _with_outliers(records, config.sequence)]
     write_bytes(stage.path / "metrics.jsonl", ("\n".join(lines) + "\n").encode())
     return stage.finish([stage.path / "body.npz", stage.path / "poses.npz", *paths])

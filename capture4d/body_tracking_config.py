@@ -67,15 +67,21 @@ class ColdStartConfig:
     points: int = 700
     """Points of the scan that the search reads."""
     survivors: int = 6
-    """Starts that are followed up with other arm poses."""
-    finalists: int = 3
+    """Starts that are followed up with other poses of legs and arms."""
+    finalists: int = 4
     """Starts that are fitted in full."""
+    second_round_m: float = 0.012
+    """Misfit of the winner beyond which its limbs are tried again: 11 mm at most where all is right."""
+    shape_spread: float = 0.15
+    """Standard deviation of the shape coefficients while the search is on."""
     rough: Schedule = Schedule(iterations=12, first_scale_m=0.25, last_scale_m=0.06)
     """Of every start."""
-    arms: Schedule = Schedule(iterations=8, first_scale_m=0.12, last_scale_m=0.04)
-    """Of every arm pose tried on a survivor."""
+    limbs: Schedule = Schedule(iterations=8, first_scale_m=0.12, last_scale_m=0.04)
+    """Of every pose of a limb tried on a survivor."""
+    settle: Schedule = Schedule(iterations=15, first_scale_m=0.15, last_scale_m=0.03)
+    """Of the finalists on all points, their shape still held back, ..."""
     full: Schedule = Schedule(iterations=25, first_scale_m=0.08, last_scale_m=0.015)
-    """Of the finalists."""
+    """... and in full."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +109,18 @@ class SequenceConfig:
     """A point of skin or suit is explained by the body if it is this near."""
     check_explained: float = 0.85
     """Frames with a smaller share of explained points are flagged."""
+    check_median_m: float = 0.0025
+    """Frames whose median distance on skin and suit is larger are flagged: a body that faces backwards can lie within
+    12 mm of most points, but not this close. Raise it for scans noisier than that."""
+    outlier_median: float = 2.0
+    """Frames are flagged as well if that distance is so many times what is usual in the take, ..."""
+    least_outlier_m: float = 0.001
+    """... and larger than this."""
+    check_far: float = 0.03
+    """Frames with a larger share of skin and suit farther than `far_m` from the body, or facing elsewhere, are flagged:
+    a whole arm is 4 to 6 %."""
+    far_m: float = 0.05
+    """Distance of a point that belongs to another part of the body."""
     fail_explained: float = 0.6
     """Frames with a smaller share are lost: nothing is built upon them."""
     largest_shape: float = 3.5

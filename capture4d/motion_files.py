@@ -6,15 +6,18 @@ BVH        a file with this body's joints is read as it is, with the shape that 
            are retargeted (see `motion_retarget`). Written in centimetres
 
 Poses of SMPL's joints fit a body of the SMPL family without change (hands beyond the wrist are left out), and other
-bodies by retargeting.
+bodies by retargeting. What these joints cannot say (a second neck joint, twist bones, hands, another shape space) goes
+along in arrays of our own, `capture4d_*`: what is left between the poses that were written and those that AMASS's
+arrays alone give. Other readers pass over them; ours puts the difference back.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float, Float64
 from scipy.spatial.transform import Rotation, Slerp
 
 from capture4d.body import ShapedBody, with_shape
@@ -99,16 +102,31 @@ def _from_npz(path: Path, body: Body) -> PoseSequence:
         vectors, trans = arrays["poses"].astype(np.float64), arrays["trans"].astype(np.float64)
         rates = [found for name in FRAME_RATES if (found := arrays.get(name)) is not None]
         betas = arrays.get("betas")
+        rest = _Rest.read(arrays)
     if vectors.ndim != 2 or vectors.shape[1] % 3 or vectors.shape[1] < 66 or trans.shape != (len(vectors), 3):
         found = f"{vectors.shape}, {trans.shape}"
         raise InputError(f"{path}: expected poses (T, 66 or more) and trans (T, 3), found {found}")
     if not rates:
         raise InputError(f"{path}: expected a frame rate as {' or '.join(FRAME_RATES)}, found none")
+    vectors = vectors[:, :66].reshape(-1, 22, 3)
+    if rest is None or rest.joint_names != body.joint_names or len(rest.turns) != len(vectors):
+        return _from_smpl(path, body, vectors, trans, betas, float(rates[0]))
+    return rest.put_back(_from_smpl(path, body, vectors, trans, rest.shape, float(rates[0])))
+
+
+def _from_smpl(
+    path: Path,
+    body: Body,
+    vectors: Float[np.ndarray, "frames 22 3"],
+    trans: Float[np.ndarray, "frames 3"],
+    betas: Float[np.ndarray, "..."] | None,
+    fps: float,
+) -> PoseSequence:
+    """AMASS's arrays on a body; `betas` are its own shape."""
     count = len(vectors)
-    rotations = Rotation.from_rotvec(vectors[:, :66].reshape(-1, 3)).as_matrix().reshape(count, 22, 3, 3)
+    rotations = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(count, 22, 3, 3)
     rotations[:, 0] = Z_UP @ rotations[:, 0]
-    fps = float(rates[0])
-    if body.joint_names[:22] == tuple(SMPL_TREE):
+    if _is_smpl(body):
         root = body.joints[0].astype(np.float64)
         return _for_smpl(body, rotations, trans @ Z_UP.T + _turned_about_origin(root), betas, fps)
     source = Bvh(
@@ -121,6 +139,52 @@ def _from_npz(path: Path, body: Body) -> PoseSequence:
         1 / fps,
     )
     return retarget(with_shape(body, np.zeros(0, np.float32)), source, fps, place="world")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rest:
+    """What AMASS's arrays leave out of the poses that were written."""
+
+    joint_names: tuple[str, ...]
+    turns: Float64[np.ndarray, "frames joints 3"]
+    """Rotation vectors, after the rotations that AMASS's arrays give."""
+    shifts: Float64[np.ndarray, "frames 3"]
+    shape: Float64[np.ndarray, " shapes"]
+
+    @staticmethod
+    def between(plain: PoseSequence, poses: PoseSequence) -> _Rest:
+        local = np.swapaxes(plain.rotations, 2, 3).astype(np.float64) @ poses.rotations
+        turns = Rotation.from_matrix(local.reshape(-1, 3, 3)).as_rotvec().reshape(*local.shape[:2], 3)
+        shifts = poses.translations.astype(np.float64) - plain.translations
+        return _Rest(poses.joint_names, turns, shifts, poses.shape.astype(np.float64))
+
+    def put_back(self, plain: PoseSequence) -> PoseSequence:
+        turns = Rotation.from_rotvec(self.turns.reshape(-1, 3)).as_matrix().reshape(plain.rotations.shape)
+        return replace(
+            plain,
+            rotations=(plain.rotations @ turns).astype(np.float32),
+            translations=(plain.translations + self.shifts).astype(np.float32),
+            shape=self.shape.astype(np.float32),
+        )
+
+    @staticmethod
+    def read(arrays: ArrayFile) -> _Rest | None:
+        if arrays.get("capture4d_turns") is None:
+            return None
+        turns, shifts, shape = (arrays[f"capture4d_{name}"] for name in ("turns", "shifts", "shape"))
+        return _Rest(arrays.names("capture4d_joint_names"), turns, shifts, shape)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        return {
+            "capture4d_joint_names": np.array(self.joint_names, np.str_),
+            "capture4d_turns": self.turns,
+            "capture4d_shifts": self.shifts,
+            "capture4d_shape": self.shape,
+        }
+
+
+def _is_smpl(body: Body) -> bool:
+    return body.joint_names[:22] == tuple(SMPL_TREE)
 
 
 def _turned_about_origin(root: np.ndarray) -> np.ndarray:
@@ -146,11 +210,15 @@ def _for_smpl(
 
 
 def write_amass(path: Path, body: Body, poses: PoseSequence) -> None:
-    """Write AMASS's arrays for SMPL-H: Z up, hands at rest; shape as `betas` if the body is of the SMPL family."""
-    is_smpl = body.joint_names[:22] == tuple(SMPL_TREE)
-    if is_smpl:
+    """Write AMASS's arrays for SMPL-H, Z up, hands at rest, and beside them what these leave out of the poses.
+
+    `betas` hold the shape if the body is of the SMPL family.
+    """
+    betas = np.zeros(16)
+    if _is_smpl(body):
         rotations = poses.rotations[:, :22].astype(np.float64)
         trans = (poses.translations - _turned_about_origin(body.joints[0].astype(np.float64))) @ Z_UP
+        betas[: len(poses.shape)] = poses.shape[:16]
     else:
         motion = as_smpl(with_shape(body, poses.shape), poses)
         rotations = motion.rotations.as_matrix().reshape(-1, 22, 3, 3)
@@ -158,9 +226,7 @@ def write_amass(path: Path, body: Body, poses: PoseSequence) -> None:
     rotations[:, 0] = Z_UP.T @ rotations[:, 0]
     vectors = np.zeros((len(rotations), AMASS_JOINTS, 3))
     vectors[:, :22] = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_rotvec().reshape(-1, 22, 3)
-    betas = np.zeros(16)
-    if is_smpl:
-        betas[: len(poses.shape)] = poses.shape[:16]
+    plain = _from_smpl(path, body, vectors[:, :22], trans, poses.shape, poses.fps)
     write_npz(
         path,
         poses=vectors.reshape(len(vectors), -1),
@@ -168,6 +234,7 @@ def write_amass(path: Path, body: Body, poses: PoseSequence) -> None:
         betas=betas,
         gender=np.array("neutral"),
         mocap_framerate=np.float64(poses.fps),
+        **_Rest.between(plain, poses).arrays(),
     )
 
 

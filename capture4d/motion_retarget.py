@@ -104,6 +104,13 @@ SMPL_TREE: dict[str, tuple[int, tuple[float, float, float]]] = {
 }
 """SMPL's first 22 joints, which its whole family shares: parent and offset of an adult in a T-pose, rounded, metres."""
 
+AIMS = {
+    "spine1": "spine2", "spine2": "spine3", "spine3": "neck", "neck": "head",
+    **{f"{side}_{joint}": f"{side}_{following}" for side in ("left", "right") for joint, following in (
+        ("hip", "knee"), ("knee", "ankle"), ("collar", "shoulder"), ("shoulder", "elbow"), ("elbow", "wrist"))},
+}  # fmt: skip
+"""The joint that each joint of SMPL's chains carries next."""
+
 SCHEMES = (
     _smpl(),
     _cmu("UpLeg", "Leg", "Foot", ("LowerBack", "Spine", "Spine1"), ("Neck", "Neck1"), "Shoulder", "Arm", "ForeArm",
@@ -166,9 +173,10 @@ def retarget(
 def as_smpl(shaped: ShapedBody, poses: PoseSequence) -> Bvh:
     """The inverse of `retarget` onto SMPL's first 22 joints, in the world of the poses.
 
-    What lies between two joints that SMPL knows, such as every second joint of our spine, is summed up in the next.
+    What lies between two joints that SMPL knows, such as every second joint of our spine, is summed up in the next;
+    each joint then turns the least that points it at where the next one really is.
     """
-    names, parents = list(shaped.body.joint_names), shaped.body.parents
+    names = list(shaped.body.joint_names)
     scheme, tree = SCHEMES[0], list(SMPL_TREE)
     missing = sorted(set(scheme.drives) - set(names))
     if missing:
@@ -182,9 +190,7 @@ def as_smpl(shaped: ShapedBody, poses: PoseSequence) -> Bvh:
         np.zeros((len(poses.rotations), 3)),
         1 / poses.fps,
     )
-    ours = poses.rotations.astype(np.float64)
-    for joint in range(1, len(names)):
-        ours[:, joint] = ours[:, parents[joint]] @ ours[:, joint]
+    ours, centres = _world(shaped, poses)
     driver = {theirs: mine for mine, theirs in scheme.drives.items()}
     world = np.empty((len(ours), len(tree), 3, 3))
     for joint, name in enumerate(tree):
@@ -192,7 +198,12 @@ def as_smpl(shaped: ShapedBody, poses: PoseSequence) -> Bvh:
             world[:, joint] = world[:, source.parents[joint]]
             continue
         alignment = _limb_alignment(shaped, scheme, source, driver[name])
-        world[:, joint] = ours[:, names.index(driver[name])] @ alignment.T
+        mine = names.index(driver[name])
+        world[:, joint] = ours[:, mine] @ alignment.T
+        if name in AIMS:
+            aim = names.index(driver[AIMS[name]])
+            expected = ours[:, mine] @ (shaped.joints[aim] - shaped.joints[mine])
+            world[:, joint] = _smallest_turns(expected, centres[:, aim] - centres[:, mine]) @ world[:, joint]
     scale = _leg(shaped) / _source_leg(scheme, source)
     local = _relative(world, source.parents)
     return replace(
@@ -200,6 +211,17 @@ def as_smpl(shaped: ShapedBody, poses: PoseSequence) -> Bvh:
         rotations=Rotation.from_matrix(local.reshape(-1, 3, 3)),
         root_positions=(poses.translations + shaped.joints[0]) / scale,
     )
+
+
+def _world(shaped: ShapedBody, poses: PoseSequence) -> tuple[np.ndarray, np.ndarray]:
+    """World rotations (T, J, 3, 3) and centres (T, J, 3) of the joints."""
+    rotations = poses.rotations.astype(np.float64)
+    centres = np.tile(shaped.joints[0] + poses.translations[:, None], (1, len(shaped.joints), 1))
+    for joint in range(1, len(shaped.joints)):
+        parent = shaped.body.parents[joint]
+        centres[:, joint] = centres[:, parent] + rotations[:, parent] @ (shaped.joints[joint] - shaped.joints[parent])
+        rotations[:, joint] = rotations[:, parent] @ rotations[:, joint]
+    return rotations, centres
 
 
 def pose_sequence(
@@ -236,7 +258,8 @@ def _relative(world: np.ndarray, parents: np.ndarray) -> np.ndarray:
 
 
 def _limb_alignment(shaped: ShapedBody, scheme: _Scheme, bvh: Bvh, name: str) -> np.ndarray:
-    """Turns our limb in its rest pose onto the source's; the identity for what is no limb."""
+    """Turns our limb in its rest pose onto the source's; the identity for what is no limb. A hand goes with its arm."""
+    name = name.replace("wrist", "lowerarm01")
     if name not in scheme.limbs:
         return np.eye(3)
     names = shaped.body.joint_names
@@ -275,3 +298,12 @@ def _align(source: np.ndarray, target: np.ndarray) -> np.ndarray:
     """The smallest rotation, (3, 3), that turns one direction onto another."""
     unit = np.stack([target / np.linalg.norm(target), source / np.linalg.norm(source)])
     return Rotation.align_vectors(unit[:1], unit[1:])[0].as_matrix()
+
+
+def _smallest_turns(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """The same for many directions, (T, 3) each: (T, 3, 3)."""
+    source, target = (each / np.linalg.norm(each, axis=1, keepdims=True) for each in (source, target))
+    across = np.cross(source, target)
+    sine = np.linalg.norm(across, axis=1)
+    angle = np.arctan2(sine, np.einsum("ta,ta->t", source, target))
+    return Rotation.from_rotvec(across * (angle / np.maximum(sine, 1e-12))[:, None]).as_matrix()

@@ -85,6 +85,7 @@ def save_garment(path: str | Path, garment: Garment) -> None:
         "embedding_faces": garment.embedding_faces,
         "embedding_barycentric": garment.embedding_barycentric,
         "skin_weights": garment.skin_weights,
+        "body_shape": garment.body_shape,
     }
     write_npz(
         path,
@@ -102,6 +103,7 @@ def load_garment(path: str | Path) -> Garment:
             embedding_faces=arrays.get("embedding_faces"),
             embedding_barycentric=arrays.get("embedding_barycentric"),
             skin_weights=arrays.get("skin_weights"),
+            body_shape=arrays.get("body_shape"),
         )
 
 

@@ -42,10 +42,12 @@ from capture4d.types import Body, Garment, Mesh, PoseSequence, Rig, Scan
 from capture4d.workdir import read_json, write_json, write_npz
 
 __all__ = [
+    "METRES",
     "Capture",
     "Colour",
     "TruthFrame",
     "TruthModel",
+    "Units",
     "capture_digest",
     "format_colour",
     "load_body",
@@ -79,7 +81,8 @@ Colour = tuple[int, int, int]
 """sRGB, 0 to 255."""
 
 Units = Literal["m", "cm", "mm", "in"]
-_METRES: dict[Units, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+METRES: dict[Units, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+"""Metres in a unit."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -246,7 +249,7 @@ def read_scan(capture: Capture, frame_id: int) -> Scan:
         raise InputError(f"{path}: expected a colour per vertex, found none, nor a texture")
     mesh = found.mesh
     if capture.units != "m":
-        mesh = mesh.with_vertices(mesh.vertices * np.float32(_METRES[capture.units]))
+        mesh = mesh.with_vertices(mesh.vertices * np.float32(METRES[capture.units]))
     return Scan(mesh, found.colours, frame_id, capture.time_s(frame_id))
 
 
@@ -326,7 +329,7 @@ def read_template(capture: Capture) -> Garment:
         if path.is_file():
             mesh = read_mesh(path).mesh
             if capture.units != "m":
-                mesh = mesh.with_vertices(mesh.vertices * np.float32(_METRES[capture.units]))
+                mesh = mesh.with_vertices(mesh.vertices * np.float32(METRES[capture.units]))
             return Garment(mesh, {f"border_{index}": loop for index, loop in enumerate(boundary_loops(mesh.faces))})
     raise InputError(
         f"{capture.path / 'template.npz'}: no such file, nor a template.obj; registration needs a template"

@@ -222,6 +222,8 @@ class Garment:
     embedding_barycentric: Float32[np.ndarray, "verts 3"] | None = None
     skin_weights: Float32[np.ndarray, "verts joints"] | None = None
     """None for a garment (or any other template) without a body."""
+    body_shape: Float32[np.ndarray, " shapes"] | None = None
+    """Shape of the person in whose rest pose the template lies; None if nobody knows."""
 
     def __post_init__(self) -> None:
         verts = len(self.template.vertices)
@@ -231,6 +233,9 @@ class Garment:
         if self.embedding_faces is not None:
             _require_array("Garment", "embedding_faces", self.embedding_faces, (verts,), np.int32)
             _require_array("Garment", "embedding_barycentric", self.embedding_barycentric, (verts, 3), np.float32)
+        if self.body_shape is not None:
+            _require_array("Garment", "body_shape", self.body_shape, (None,), np.float32)
+            _require_finite("Garment", "body_shape", self.body_shape)
         if self.skin_weights is not None:
             _require_array("Garment", "skin_weights", self.skin_weights, (verts, None), np.float32)
             if np.abs(self.skin_weights.sum(axis=1) - 1).max(initial=0) > 1e-3:

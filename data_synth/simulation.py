@@ -19,13 +19,13 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation, Slerp
 
 from capture4d.body import PosedBody, ShapedBody, skin, unskin, with_pose
+from capture4d.garment_binding import bind
 from capture4d.mesh import vertex_normals
 from capture4d.open3d_loading import import_open3d
 from capture4d.types import PoseSequence
 from capture4d.warp_loading import import_warp
 from data_synth.config import Fabric, SimulationConfig
 from data_synth.patterns import PanelMesh, Pattern, smooth_noise
-from data_synth.template import bind
 
 __all__ = ["approach_poses", "dress", "simulate"]
 
@@ -205,7 +205,7 @@ class _Hold:
         mesh: PanelMesh, cloth: np.ndarray, body: PosedBody, masses: np.ndarray, config: SimulationConfig
     ) -> _Hold:
         """Hold the cloth, (V, 3) with limbs well apart, where it is on the body now; firmest at the shoulders."""
-        _, _, weights = bind(mesh, cloth, body)
+        _, _, weights = bind(cloth, mesh.faces, body)
         rest, flagged = unskin(cloth, weights, body.transforms)
         assert not flagged.any(), "the dressing pose cannot be unposed"
         bumps = smooth_noise(mesh.vertex_uv, config.hold_ripple_m, config.hold_ripple_width_m, np.random.default_rng(1))

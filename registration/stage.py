@@ -21,9 +21,10 @@ import numpy as np
 
 from capture4d.body_stage import load_tracking, tracking_digest
 from capture4d.errors import InputError
+from capture4d.garment_binding import with_body_shape
 from capture4d.garment_stage import load_garment_scan
 from capture4d.scans import Capture, load_garment, read_body, read_capture, read_poses, read_template, save_garment
-from capture4d.types import RegisteredSequence
+from capture4d.types import Body, Garment, PoseSequence, RegisteredSequence
 from capture4d.workdir import (
     Stage,
     open_stage,
@@ -79,12 +80,13 @@ def run(
     if body_folder is not None:
         upstream["body"] = tracking_digest(body_folder, capture)
     stage = open_stage(output, name="register", schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite)
-    garment = read_template(description)
+    _analysis.cache_clear()
+    garment = _template(description, body_folder)
     if description.boundary_colours and not garment.loops:
         raise InputError(f"{capture}: expected a template with open borders, as its scans have; found none")
     if not (output / "garment.npz").is_file():
         save_garment(output / "garment.npz", garment)
-    mover = _mover(description, body_folder, _analysis(capture, config))
+    mover = _mover(description, body_folder, _analysis(capture, body_folder, config))
     frame_ids = description.frame_ids
     pending = set(stage.pending(frame_ids))
     jobs = [
@@ -112,23 +114,35 @@ def load_registration(folder: Path) -> RegisteredSequence:
     return RegisteredSequence(garment, vertices, np.array(residual, np.float32), np.array(frame_ids, np.int32))
 
 
-def _mover(capture: Capture, body_folder: Path | None, analysis: TemplateAnalysis) -> Mover | None:
+def _moving(capture: Capture, body_folder: Path | None) -> tuple[Body | None, PoseSequence | None]:
+    """The body and its poses: those that were tracked, or those of the capture."""
     if body_folder is None:
-        return Mover.create(analysis, read_body(capture), read_poses(capture))
-    return Mover.create(analysis, *load_tracking(body_folder))
+        return read_body(capture), read_poses(capture)
+    return load_tracking(body_folder)
+
+
+def _template(capture: Capture, body_folder: Path | None) -> Garment:
+    """The template on the person who moves it."""
+    garment = read_template(capture)
+    body, poses = _moving(capture, body_folder)
+    return garment if body is None or poses is None else with_body_shape(garment, body, poses.shape)
+
+
+def _mover(capture: Capture, body_folder: Path | None, analysis: TemplateAnalysis) -> Mover | None:
+    return Mover.create(analysis, *_moving(capture, body_folder))
 
 
 @lru_cache(maxsize=2)
-def _analysis(capture: Path, config: RegistrationConfig) -> TemplateAnalysis:
+def _analysis(capture: Path, body_folder: Path | None, config: RegistrationConfig) -> TemplateAnalysis:
     """One analysis per process, template and settings."""
-    return analyse_template(read_template(read_capture(capture)), config)
+    return analyse_template(_template(read_capture(capture), body_folder), config)
 
 
 def _register_job(config: RegistrationConfig, job: SegmentJob) -> int:
     """Register and write the frames of a run; how many were new."""
     description = read_capture(job.capture)
     frame_ids = description.frame_ids
-    analysis = _analysis(job.capture, config)
+    analysis = _analysis(job.capture, job.body_folder, config)
     mover = _mover(description, job.body_folder, analysis)
     pending = set(job.stage.pending([frame_ids[position] for position in job.positions]))
 

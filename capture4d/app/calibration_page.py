@@ -16,7 +16,14 @@ from capture4d.app.charts import Line, line_chart
 from capture4d.rig_check import CameraCheck
 from capture4d.workdir import write_bytes
 
-__all__ = ["calibration_page", "print_calibration", "print_check", "write_page"]
+__all__ = [
+    "calibration_charts",
+    "calibration_page",
+    "calibration_tiles",
+    "print_calibration",
+    "print_check",
+    "write_page",
+]
 
 BLUE, ORANGE, GREY = "#2f62c9", "#d9772b", "#8d97a5"
 _COLUMNS: tuple[tuple[str, str, str], ...] = (
@@ -86,7 +93,7 @@ def calibration_page(report: Mapping[str, Any]) -> str:
     return environment.get_template("calibration.html.jinja").render(
         version=version("capture4d"),
         subtitle=f"{counts}; {report['board']}",
-        tiles=_tiles(report),
+        tiles=calibration_tiles(report),
         advice=report["advice"],
         headings=[heading for _, heading, _ in _COLUMNS],
         cameras=[
@@ -97,7 +104,7 @@ def calibration_page(report: Mapping[str, Any]) -> str:
             }
             for row in report["cameras"]
         ],
-        charts=_charts(report),
+        charts=calibration_charts(report),
         names=names,
         shared=report["shared_poses"],
         most_shared=max(1, max(max(row) for row in report["shared_poses"])),
@@ -106,8 +113,8 @@ def calibration_page(report: Mapping[str, Any]) -> str:
     )
 
 
-def _tiles(report: Mapping[str, Any]) -> list[tuple[str, str, str]]:
-    """(value, unit, what it is)."""
+def calibration_tiles(report: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """(value, unit, what it is) of the figures that matter most."""
     sigmas = [row["centre_sigma_mm"] for row in report["cameras"]]
     tiles = [
         (f"{report['residual_median_px']:.3f}", "px", "residual, median"),
@@ -121,7 +128,8 @@ def _tiles(report: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     return tiles
 
 
-def _charts(report: Mapping[str, Any]) -> list[dict[str, str]]:
+def calibration_charts(report: Mapping[str, Any]) -> list[dict[str, str]]:
+    """Titles and SVGs of the curves over the poses."""
     poses = list(range(len(report["poses"])))
     residuals = [
         Line("median", np.array([row["median_px"] for row in report["poses"]]), BLUE),

@@ -276,6 +276,55 @@ class RegisterMesh:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Template:
+    """Make a template of your own garment mesh, or of a part of the body: bound, its borders named, its UVs checked."""
+
+    mesh: Annotated[Positional[Path | None], arg(metavar="MESH")] = None
+    """Garment mesh that lies on the body: obj, ply or glb. Left out with --region."""
+    output: Path
+    """template.npz to write, as in a capture folder."""
+    body: Path | None = None
+    """The body it lies on, a body.npz; the built-in one if absent."""
+    poses: Path | None = None
+    """Motion file with the pose and the shape in which the garment lies on the body; the rest pose of the mean shape if
+    absent."""
+    frame: int | None = None
+    """Frame of that file, by its number; the first if absent."""
+    region: Literal["tshirt", "longsleeve", "trousers", "shorts"] | None = None
+    """Take this part of the body as the garment."""
+    uv: Literal["auto", "keep", "fresh", "none"] = "auto"
+    """Keep the mesh's UVs or cut fresh ones; `auto` keeps them if nothing is wrong with them."""
+    names: tuple[str, ...] = ()
+    """Names of the border loops, the one with the most vertices first; found by their place if absent."""
+    units: Literal["m", "cm", "mm", "in"] = "m"
+    """Of the mesh."""
+
+    def __call__(self) -> int:
+        from capture4d.template_stage import run
+
+        garment, report = run(
+            self.mesh,
+            self.output,
+            body=self.body,
+            poses=self.poses,
+            frame=self.frame,
+            region=self.region,
+            uv=self.uv,
+            names=self.names,
+            units=self.units,
+        )
+        loops = ", ".join(f"{name} ({len(loop)})" for name, loop in garment.loops.items())
+        faults = ", ".join(report.uv.faults())
+        cut = f"cut afresh{f' ({faults})' if faults else ''}"
+        uvs = "none" if garment.template.uv is None else cut if report.fresh_uv else "kept"
+        print(f"{report.vertices} vertices, {report.faces} faces, {1e3 * report.distance_m:.1f} mm from the body")
+        print(f"borders: {loops}")
+        print(f"UVs: {uvs}")
+        print(f"template: {self.output}")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
 class Run(_Stage):
     """Run every stage on a capture: extract, track if it brings no poses, register, report."""
 
@@ -464,6 +513,7 @@ _COMMANDS: Mapping[str, Any] = {
     "synth": Synth,
     "scan": Scan,
     "check": Check,
+    "template": Template,
     "extract": Extract,
     "track": Track,
     "register": Register,

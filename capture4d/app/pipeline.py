@@ -14,12 +14,12 @@ __all__ = ["broken_limits", "needs_tracking", "parse_limits", "run_all", "run_de
 
 
 def run_demo(output: Path, *, workers: int, overwrite: bool = False) -> Path:
-    """Synthesise `output`/capture, then run everything on it; the path of the report."""
+    """Synthesise `output`/capture, then run everything on it, its poses left aside; the path of the report."""
     from data_synth.config import PRESETS
     from data_synth.stage import run as synthesise
 
     synthesise(output / "capture", PRESETS["demo"], workers=workers, overwrite=overwrite)
-    return run_all(output / "capture", output, RegistrationConfig(), workers=workers, overwrite=overwrite)
+    return run_all(output / "capture", output, RegistrationConfig(), track=True, workers=workers, overwrite=overwrite)
 
 
 def run_all(

@@ -22,6 +22,7 @@ import numpy as np
 from capture4d.app.charts import Line, line_chart
 from capture4d.app.report_metrics import METRICS, VERDICTS, column, summarise, truth_measures
 from capture4d.app.report_pictures import Framing, Panel, colour_bar, draw_frame
+from capture4d.app.report_stages import Calibration, StagePictures, Tracking, calibration, draw_stages, tracking
 from capture4d.errors import InputError
 from capture4d.evaluation import correspondence_errors, material_points
 from capture4d.scans import Capture, TruthModel, read_capture, read_scan, read_truth_model, read_truth_vertices
@@ -31,7 +32,7 @@ from registration.stage import load_registration
 
 __all__ = ["ReportConfig", "run"]
 
-SCHEMA = 1
+SCHEMA = 2
 MAX_FLAGGED_ROWS = 60
 BLUE, ORANGE, GREEN, GREY = "#2f62c9", "#d9772b", "#2f8f5b", "#8d97a5"
 CURVES: tuple[tuple[str, float, tuple[tuple[str, str, str], ...]], ...] = (
@@ -65,12 +66,23 @@ CURVES: tuple[tuple[str, float, tuple[tuple[str, str, str], ...]], ...] = (
 """Charts: title, start of the vertical axis, and curves (name, metric, colour)."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Stages:
+    """What came before registration."""
+
+    calibration: Calibration | None
+    tracking: Tracking | None
+    pictures: Sequence[StagePictures]
+
+
 @dataclass(frozen=True, slots=True)
 class ReportConfig:
     """What the report shows."""
 
     pictures: int = 6
     """Frames drawn, spread over the take; the worst flagged frame comes on top."""
+    stage_pictures: int = 3
+    """Frames whose extraction and tracking are drawn."""
     truth_frames: int = 240
     """Frames measured against the truth at most, spread over the take."""
 
@@ -104,10 +116,24 @@ def run(
     )
     records = [json.loads(line) for line in (work / "registration" / "metrics.jsonl").read_text().splitlines()]
     _measure_truth(work, description, records, config, workers)
+    tracked = tracking(description, work)
     summary = summarise(records)
+    if tracked is not None:
+        summary |= tracked.metrics
     heat = {"fit error": summary["fit_p95_mm"], "correspondence error": summary.get("correspondence_p95_mm")}
     scales = {title: _round_up(value) for title, value in heat.items() if value is not None}
     rows = _draw(work, description, _drawn_rows(records, config.pictures), scales, workers)
+    stages = Stages(
+        calibration(description, work),
+        tracked,
+        draw_stages(
+            work,
+            description,
+            _registered(work / "registration"),
+            _spread(len(records), config.stage_pictures),
+            workers=workers,
+        ),
+    )
     write_json(
         folder / "metrics.json",
         {
@@ -119,7 +145,7 @@ def run(
             "frames": len(records),
         },
     )
-    page = _page(work, description, records, summary, scales, rows)
+    page = _page(work, description, records, summary, scales, rows, stages)
     write_bytes(folder / "index.html", page.encode())
     stage.finish([])  # the report holds times, which differ between equal runs; nothing is made from it
     return folder / "index.html"
@@ -210,6 +236,7 @@ def _page(
     summary: Mapping[str, float | None],
     scales: Mapping[str, float],
     pictures: Mapping[int, list[list[Panel]]],
+    stages: Stages,
 ) -> str:
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("capture4d.app", "."), autoescape=True, undefined=jinja2.StrictUndefined
@@ -239,6 +266,14 @@ def _page(
         flagged_left_out=max(0, len(flagged) - MAX_FLAGGED_ROWS),
         charts=list(_charts(records)),
         columns=2 + len(scales),
+        calibration=stages.calibration,
+        tracking=_tracking_part(stages.tracking),
+        extraction=[{"frame_id": records[each.row]["frame_id"], "panels": each.extraction} for each in stages.pictures],
+        tracked=[
+            {"frame_id": records[each.row]["frame_id"], "panels": each.tracking}
+            for each in stages.pictures
+            if each.tracking
+        ],
         scales=[{"title": title, "high": f"{high:g}", "uri": colour_bar(high)} for title, high in scales.items()],
         frames=[
             {
@@ -256,6 +291,22 @@ def _page(
         run=list(_run_rows(work, capture, records)),
         settings=list(_flat(read_json(work / "registration" / "stage.json")["config"])),
     )
+
+
+def _tracking_part(tracked: Tracking | None) -> dict[str, Any] | None:
+    """Tracking as the page shows it."""
+    if tracked is None:
+        return None
+    flagged = tracked.flagged()
+    return {
+        "tiles": tracked.section.tiles,
+        "charts": tracked.section.charts,
+        "flagged": [
+            {"frame_id": each["frame_id"], "verdict": each["verdict"], "reasons": "; ".join(each["reasons"])}
+            for each in flagged[:MAX_FLAGGED_ROWS]
+        ],
+        "left_out": max(0, len(flagged) - MAX_FLAGGED_ROWS),
+    }
 
 
 def _tiles(summary: Mapping[str, float | None]) -> Sequence[dict[str, str]]:

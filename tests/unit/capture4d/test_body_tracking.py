@@ -12,9 +12,9 @@ from benchmarks.dressed_body import dress_body, sample_scan
 from capture4d.body import pose_frame, with_pose, with_shape
 from capture4d.body_anny import load_anny
 from capture4d.body_prior import inverse_left_jacobian, joint_prior, limit_terms, pull_terms
-from capture4d.body_sequence import Tracker, between
+from capture4d.body_sequence import Tracker, between, judge, outlying
 from capture4d.body_tracking import ScanPoints, fit_body
-from capture4d.body_tracking_config import FitConfig, Schedule, TrackingConfig
+from capture4d.body_tracking_config import FitConfig, Schedule, SequenceConfig, TrackingConfig
 from capture4d.body_tracking_jacobian import BodyState, linearise, match, pose_surface, tracked_body
 from capture4d.types import Body, Mesh
 
@@ -227,6 +227,52 @@ def test_a_pose_is_found_from_nowhere() -> None:
     state = Tracker.create(body, TrackingConfig()).begin(scan, None).state
     found = pose_surface(tracked_body(body), state)
     assert np.linalg.norm(found.vertices - true.vertices(), axis=1).mean() < 0.01
+
+
+@pytest.mark.slow
+def test_a_hop_that_faces_away_is_not_taken_for_its_mirror() -> None:
+    """Knees bent, trunk tilted: with a free shape the search made a stranger person that faces the other way."""
+    body = load_anny()
+    person = with_shape(body, np.array([-1.0, 1.1, -0.5, 0.6, 0.3, -0.4], np.float32))
+    turns = {
+        "root": (25, 150, 0),
+        "upperleg01.L": (-70, 0, 0),
+        "lowerleg01.L": (75, 0, 0),
+        "upperleg01.R": (-35, 0, 0),
+        "lowerleg01.R": (60, 0, 0),
+        "upperarm01.L": (0, -60, 0),
+        "lowerarm01.L": (0, -70, 0),
+    }
+    rotations = np.repeat(np.eye(3)[None], len(body.joint_names), axis=0)
+    for name, degrees in turns.items():
+        rotations[body.joint_names.index(name)] = Rotation.from_euler("xyz", degrees, degrees=True).as_matrix()
+    true = with_pose(person, rotations, np.array([0.1, -0.15, 0.2]))
+    scan = sample_scan(dress_body(true, 1.0), np.random.default_rng(3), points=3500)
+    found = Tracker.create(body, TrackingConfig()).begin(scan, None)
+    assert found.quality.reasons == ()
+    surface = pose_surface(tracked_body(body), found.state)
+    assert np.linalg.norm(surface.vertices - true.vertices(), axis=1).mean() < 0.01
+
+
+def test_a_body_that_lies_off_most_points_is_flagged() -> None:
+    """Front and back exchanged: nearly all points are explained, but none closely."""
+    config = SequenceConfig()
+    rng = np.random.default_rng(0)
+    near = judge(0.001 * rng.standard_normal(2000), np.zeros(2000, bool), config)
+    off = judge(0.005 * rng.standard_normal(2000), np.zeros(2000, bool), config)
+    assert off.explained > config.check_explained
+    assert near.reasons == ()
+    assert len(off.reasons) == 1
+    assert "3.4 mm from the body in the median" in off.reasons[0]
+
+
+def test_a_frame_that_lies_off_as_no_other_of_the_take_is_an_outlier() -> None:
+    medians = np.array([0.0008, 0.0007, np.nan, 0.0009, 0.0021, 0.0008])
+    usual, outliers = outlying(medians, SequenceConfig())
+    assert usual == 0.0008
+    assert outliers.tolist() == [False, False, False, False, True, False]
+    assert not outlying(medians / 10, SequenceConfig())[1].any(), "tenths of a millimetre are no fault"
+    assert not outlying(np.full(3, np.nan), SequenceConfig())[1].any()
 
 
 def test_unknown_shape_information_is_symmetric_and_positive(stick: Body) -> None:

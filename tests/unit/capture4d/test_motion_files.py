@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,9 +13,10 @@ from scipy.spatial.transform import Rotation
 from capture4d.body import pose_frame, with_shape
 from capture4d.body_anny import load_anny
 from capture4d.body_smpl import SMPL_JOINTS
+from capture4d.bvh_format import Bvh, format_bvh
 from capture4d.errors import InputError
 from capture4d.motion_files import read_motion, resample, write_motion
-from capture4d.motion_retarget import SMPL_TREE
+from capture4d.motion_retarget import SMPL_TREE, retarget
 from capture4d.types import Body, Mesh, PoseSequence
 
 
@@ -88,6 +90,90 @@ def test_amass_round_trip_on_a_body_of_its_family(smpl_like: Body, tmp_path: Pat
         assert float(arrays["mocap_framerate"]) == 60.0
     back = read_motion(tmp_path / "clip.npz", smpl_like)
     np.testing.assert_allclose(centres(smpl_like, back), centres(smpl_like, poses), atol=1e-5)
+
+
+def test_a_hand_of_a_body_of_its_family_survives_amass(smpl_like: Body, tmp_path: Path) -> None:
+    poses = random_poses(smpl_like, 8)
+    write_motion(tmp_path / "clip.npz", smpl_like, poses, amass=True)
+    back = read_motion(tmp_path / "clip.npz", smpl_like)
+    np.testing.assert_allclose(back.rotations, poses.rotations, atol=1e-5)
+
+
+def cmu_clip(spine: tuple[str, ...], arm: tuple[str, ...], leg: tuple[str, ...], seed: int) -> Bvh:
+    """A random clip of the CMU database's skeleton in centimetres, T-pose at rest, under one of its namings."""
+    rng = np.random.default_rng(seed)
+    names, parents, offsets = ["Hips"], [-1], [(0.0, 0.0, 0.0)]
+
+    def grow(parent: int, chain: tuple[str, ...], steps: Sequence[tuple[float, float, float]]) -> int:
+        for name, step in zip(chain, steps, strict=True):
+            names.append(name)
+            parents.append(parent)
+            offsets.append(step)
+            parent = len(names) - 1
+        return parent
+
+    grow(0, spine, [(0, 5, 0), (0, 11, 0), (0, 11, 0), (0, 13, 0), (0, 6, 0), (0, 6, 0)])
+    for side, x in (("Left", 1.0), ("Right", -1.0)):
+        words = tuple(side + word for word in leg)
+        grow(0, words, [(9 * x, -4, 0), (0, -42, 0), (0, -41, 0)])
+        words = tuple(side + word for word in arm)
+        grow(3, words, [(4 * x, 9, 0), (14 * x, 0, 0), (28 * x, 0, 0), (24 * x, 0, 0)])
+    frames = 40
+    knots = 0.35 * rng.standard_normal((5, len(names), 3))
+    at = np.linspace(0, 4, frames)
+    vectors = np.stack([np.interp(at, range(5), knots[:, j, a]) for j in range(len(names)) for a in range(3)], axis=1)
+    places = np.array([0.0, 95.0, 0.0]) + np.outer(at, rng.normal(0, 20, 3) * (1, 0, 1))
+    return Bvh(
+        Path("generated.bvh"), tuple(names), np.array(parents), np.array(offsets, float),
+        Rotation.from_rotvec(vectors.reshape(-1, 3)), places, 1 / 120,
+    )  # fmt: skip
+
+
+NAMINGS = (
+    (("LowerBack", "Spine", "Spine1", "Neck", "Neck1", "Head"), ("Shoulder", "Arm", "ForeArm", "Hand"),
+     ("UpLeg", "Leg", "Foot")),
+    (("lowerback", "Chest", "Chest2", "lowerneck", "Neck", "Head"), ("Collar", "Shoulder", "Elbow", "Wrist"),
+     ("Hip", "Knee", "Ankle")),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("naming", NAMINGS, ids=["motionbuilder", "daz"])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_cmu_clip_drives_the_body_and_goes_out_in_every_format(tmp_path: Path, naming: tuple, seed: int) -> None:
+    body, source = load_anny(), cmu_clip(*naming, seed)
+    (tmp_path / "in.bvh").write_text(format_bvh(source, np.ones((len(source.parents), 3))))
+    poses = read_motion(tmp_path / "in.bvh", body, fps=60)
+    places = centres(body, poses)
+    assert len(places) == 20
+
+    # every limb points where the clip's does
+    world = source.world_rotations()[::2]
+    for name, end, theirs in (("upperarm01.L", "lowerarm01.L", 1), ("lowerarm01.R", "wrist.R", 2)):
+        ours = places[:, body.joint_names.index(end)] - places[:, body.joint_names.index(name)]
+        joint = source.joint_names.index(("Left" if name.endswith("L") else "Right") + naming[1][theirs])
+        along = world[:, joint] @ [1.0 if name.endswith("L") else -1.0, 0.0, 0.0]
+        np.testing.assert_allclose(ours / np.linalg.norm(ours, axis=1, keepdims=True), along, atol=1e-3)
+
+    for file, amass in (("out.bvh", False), ("out.npz", False), ("amass.npz", True)):
+        write_motion(tmp_path / file, body, poses, amass=amass)
+        back = centres(body, read_motion(tmp_path / file, body))
+        assert np.linalg.norm(back - places, axis=2).max() < 1e-3
+
+    with np.load(tmp_path / "amass.npz") as arrays:
+        np.savez(tmp_path / "plain.npz", **{name: arrays[name] for name in ("poses", "trans", "mocap_framerate")})
+    plain = centres(body, read_motion(tmp_path / "plain.npz", body))
+    joints = [body.joint_names.index(name) for name in ("head", "wrist.L", "wrist.R", "foot.L", "foot.R")]
+    apart = plain - places - (plain - places)[:, :1]
+    assert np.linalg.norm(apart[:, joints], axis=2).max() < 0.03, "readers of AMASS's own arrays see the pose"
+
+
+def test_hands_of_a_t_pose_continue_the_arms() -> None:
+    source = cmu_clip(*NAMINGS[0], seed=0)
+    still = replace(source, rotations=Rotation.identity(40 * len(source.parents)))
+    body = load_anny()
+    poses = retarget(with_shape(body, np.zeros(0, np.float32)), still, 60.0)
+    wrist = poses.rotations[0, body.joint_names.index("wrist.L")]
+    assert np.degrees(Rotation.from_matrix(wrist).magnitude()) < 1.0
 
 
 def test_amass_is_z_up(smpl_like: Body, tmp_path: Path) -> None:

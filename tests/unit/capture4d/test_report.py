@@ -1,6 +1,7 @@
 import json
 import re
 import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,19 +9,22 @@ import pytest
 from capture4d.app.charts import Line, line_chart, nice_ticks
 from capture4d.app.report import ReportConfig, run
 from capture4d.app.report_metrics import summarise
+from capture4d.body_anny import load_anny
 from capture4d.errors import InputError
 from capture4d.mesh import boundary_loops
 from capture4d.scans import (
     Capture,
     TruthFrame,
     TruthModel,
+    save_body,
     save_garment,
+    save_poses,
     write_capture_description,
     write_scan,
     write_truth_frame,
     write_truth_model,
 )
-from capture4d.types import Garment, Mesh, Scan
+from capture4d.types import Garment, Mesh, PoseSequence, Scan
 from capture4d.workdir import open_stage, write_bytes, write_json, write_npy, write_npz
 
 FRAMES = 8
@@ -165,3 +169,52 @@ def test_gaps_interrupt_a_curve():
     curve = re.search(r'class="curve" d="([^"]*)"', chart).group(1)
     assert curve.count("M") == 3
     assert curve.count("h.1") == 1
+
+
+def test_tracking_is_shown_beside_the_truth(work):
+    body = load_anny()
+    still = np.repeat(np.eye(3, dtype=np.float32)[None], len(body.joint_names), axis=0)
+    rotations, ids = np.repeat(still[None], FRAMES, axis=0), np.arange(FRAMES, dtype=np.int32)
+    places, shape = np.zeros((FRAMES, 3), np.float32), np.zeros(3, np.float32)
+    truth = PoseSequence(rotations, places, shape, ids, 60.0, body.joint_names)
+    save_poses(work / "capture" / "truth" / "poses.npz", truth)
+    save_body(work / "body" / "body.npz", body)
+    off = np.array([0.002, 0, 0], np.float32)
+    save_poses(work / "body" / "poses.npz", replace(truth, translations=places + off))
+    lines = []
+    for index in range(FRAMES):
+        seen = np.arange(len(body.joint_names)) < 5
+        write_npz(work / "body" / "refined" / f"{index:06d}.npz", seen=seen)
+        lines.append({"frame_id": index, "verdict": "good", "reasons": [], "explained": 0.97, "median_m": 0.0008,
+                      "inside": 0.0, "started_from": "motion", "cpu_s": 0.2})  # fmt: skip
+    lines[3] |= {"verdict": "lost", "reasons": ["skin & suit are gone"], "median_m": None}
+    write_bytes(work / "body" / "metrics.jsonl", "\n".join(json.dumps(line) for line in lines).encode())
+    page = run(work, config=ReportConfig(pictures=1, stage_pictures=2)).read_text()
+    metrics = metrics_of(work)
+    assert metrics["joint_mean_mm"] == pytest.approx(2.0, rel=1e-4)
+    assert metrics["track_good_percent"] == pytest.approx(87.5)
+    assert metrics["track_median_mm"] == pytest.approx(0.8)
+    assert "skin &amp; suit are gone" in page
+    assert "Joints to their true places" in page
+    assert page.count('alt="in the scan') == 4, "two frames from two sides"
+
+
+def test_a_report_without_tracking_and_rig_shows_neither(work):
+    page = run(work, config=ReportConfig(pictures=1, stage_pictures=1)).read_text()
+    assert "<h2>Tracking</h2>" not in page
+    assert "<h2>Rig</h2>" not in page
+    assert "<h2>Extraction</h2>" in page
+
+
+def test_a_calibrated_rig_is_shown_with_its_uncertainty(work):
+    camera = {"name": "cam00", "centre_sigma_mm": 0.123, "coverage_percent": 77.0}
+    report = {
+        "cameras": [camera], "poses": [{"name": "000", "median_px": 0.1, "rms_px": 0.2}], "corners": 1234,
+        "board": "charuco:9x7:90:68:DICT_4X4_50", "residual_median_px": 0.1, "hold_out": [],
+        "volume": [{"name": "000", "corner_rms_mm": 0.3}],
+    }  # fmt: skip
+    write_json(work / "capture" / "calibration.json", report)
+    page = run(work, config=ReportConfig(pictures=1, stage_pictures=1)).read_text()
+    assert "<h2>Rig</h2>" in page
+    assert "1,234 corners" in page
+    assert "0.123" in page
