@@ -544,21 +544,10 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
 
 
 def _run(arguments: list[str]) -> int:
-    if not arguments or arguments[0] in ("-h", "--help"):
-        print(_overview())
-        return 0 if arguments else 2
-    if arguments[0] == "--version":
-        from importlib.metadata import version
-
-        print(f"capture4d {version('capture4d')}")
-        return 0
-    name, *rest = arguments
-    if name not in _COMMANDS:
-        near = difflib.get_close_matches(name, _COMMANDS, n=1)
-        hint = f"; did you mean '{near[0]}'?" if near else ""
-        return _complain(f"unknown command '{name}'{hint} (see capture4d --help)", code=2)
     try:
-        return _parse(name, rest)()
+        code = _dispatch(arguments)
+        sys.stdout.flush()
+        return code
     except InputError as error:
         return _complain(str(error))
     except BrokenPipeError:  # whoever read our output, such as `head`, has seen enough
@@ -577,6 +566,23 @@ def _run(arguments: list[str]) -> int:
         return _complain(str(error))
     except KeyboardInterrupt:
         return _complain("interrupted; finished frames are kept, the same command goes on", code=130)
+
+
+def _dispatch(arguments: list[str]) -> int:
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(_overview())
+        return 0 if arguments else 2
+    if arguments[0] == "--version":
+        from importlib.metadata import version
+
+        print(f"capture4d {version('capture4d')}")
+        return 0
+    name, *rest = arguments
+    if name not in _COMMANDS:
+        near = difflib.get_close_matches(name, _COMMANDS, n=1)
+        hint = f"; did you mean '{near[0]}'?" if near else ""
+        return _complain(f"unknown command '{name}'{hint} (see capture4d --help)", code=2)
+    return _parse(name, rest)()
 
 
 def _parse(name: str, arguments: list[str]) -> Any:
