@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from rich.console import Console
 
 from benchmarks.metric import Metric
 from capture4d.evaluation import scan_errors
@@ -65,6 +66,9 @@ def run(*, quick: bool = False, frames: int = 120, workers: int = 2) -> list[Met
             for seed in (0, 1)
         ]
     rows = list(run_jobs(_measure, jobs, workers=workers, label="Synthetic takes"))
+    for job, row in zip(jobs, rows, strict=True):
+        numbers = ", ".join(f"{key} {value:.4g}" for key, value in row.items())
+        Console(stderr=True).print(f"{job.config.fabric}, seed {job.config.seed}: {numbers}", soft_wrap=True)
     with tempfile.TemporaryDirectory(prefix="capture4d-synthesis-") as scratch:
         tiny = replace(PRESETS["tiny"], frames=2, capture_every=2)
         digests = {synthesise(Path(scratch) / name, tiny, workers=1) for name in ("first", "second")}

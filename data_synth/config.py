@@ -110,7 +110,7 @@ class RelaxationConfig:
 
     vertices: int = 80_000
     """Vertices of the wrinkle mesh."""
-    sweeps: int = 24
+    sweeps: int = 30
     """Gauss-Seidel sweeps a frame. Fewer let the folds lag behind the pose a little, which calms them."""
     start_sweeps_factor: int = 8
     """How many times more where there is no frame before."""
@@ -122,7 +122,7 @@ class RelaxationConfig:
     """No vertex leaves the coarse sheet farther than this."""
     body_margin_m: float = 0.003
     """Clearance to the body."""
-    warm_start: float = 0.955
+    warm_start: float = 0.945
     """Share of the folds carried over from the frame before; the rest is the imperfection. 1 moves most smoothly, but
     then the folds are an accident of the start; below 0.5 they shimmer."""
     imperfection_m: float = 0.003
@@ -175,7 +175,13 @@ PRESETS: dict[str, SynthConfig] = {
         capture_every=4,
         template_vertices=1500,
         simulation=SimulationConfig(
-            vertices=1600, substeps=12, iterations=3, damping=0.97, calm_frames=18, approach_frames=16, rest_frames=8
+            vertices=1600,
+            substeps=12,
+            iterations=3,
+            damping=0.97,
+            calm_frames=18,
+            approach_frames=16,
+            rest_frames=8,
         ),
         relaxation=RelaxationConfig(vertices=12_000, sweeps=40),
         scanner=ScannerConfig(

@@ -91,6 +91,8 @@ def dress(shaped: ShapedBody, mesh: PanelMesh, pattern: Pattern, first: PosedBod
         rows = panel == name
         near = np.minimum(seams.query(placed[rows, :2])[0] / PILLOW_M, 1)
         placed[rows, 2] = middle_z + sign * depth * np.sqrt(1 - (1 - near) ** 2)
+        # Out of the arms on the panel's own side: sewn to the other side, cloth would have to pass through them.
+        placed[rows] = _push_outside_along(placed[rows], sign, surface, shaped.body.template.faces, clearance=0.008)
     half = np.abs(draft[panel == "front", 0]).max()
     for side, sign in (("left", 1.0), ("right", -1.0)):
         rows = panel == f"sleeve_{side}"
@@ -117,15 +119,32 @@ def _tube(draft: np.ndarray, arm: np.ndarray, sign: float, start_x: float) -> np
     return np.column_stack([sign * (start_x - v), middle + around])
 
 
-def _push_outside(points: np.ndarray, surface: np.ndarray, faces: np.ndarray, clearance: float) -> np.ndarray:
-    """Move every point nearer than `clearance`, or inside, to that distance outside the surface."""
+def _heights(points: np.ndarray, surface: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Height over the nearest face, (V,) metres, negative inside; that face's nearest point and normal, (V, 3)."""
     scene = import_open3d().t.geometry.RaycastingScene(nthreads=1)
     scene.add_triangles(surface.astype(np.float32), faces.astype(np.uint32))
-    query = points.astype(np.float32)
-    closest = scene.compute_closest_points(query)
+    closest = scene.compute_closest_points(points.astype(np.float32))
     foot, normals = closest["points"].numpy(), closest["primitive_normals"].numpy()
-    near = np.einsum("vc,vc->v", query - foot, normals) < clearance
-    return np.where(near[:, None], foot + clearance * normals, points)
+    return np.einsum("vc,vc->v", points.astype(np.float32) - foot, normals), foot, normals
+
+
+def _push_outside(points: np.ndarray, surface: np.ndarray, faces: np.ndarray, clearance: float) -> np.ndarray:
+    """Move every point nearer than `clearance`, or inside, to that distance outside the surface."""
+    heights, foot, normals = _heights(points, surface, faces)
+    return np.where((heights < clearance)[:, None], foot + clearance * normals, points)
+
+
+def _push_outside_along(
+    points: np.ndarray, sign: float, surface: np.ndarray, faces: np.ndarray, clearance: float
+) -> np.ndarray:
+    """Move every point nearer than `clearance`, or inside, along sign * Z until it is outside."""
+    points = points.copy()
+    for _ in range(200):
+        near = _heights(points, surface, faces)[0] < clearance
+        if not near.any():
+            break
+        points[near, 2] += sign * 0.5 * clearance
+    return points
 
 
 def simulate(
