@@ -65,10 +65,11 @@ def run(*, quick: bool = False, frames: int = 120, workers: int = 2) -> list[Met
             for fabric in ("jersey", "shirt-cotton")
             for seed in (0, 1)
         ]
-    rows = list(run_jobs(_measure, jobs, workers=workers, label="Synthetic takes"))
-    for job, row in zip(jobs, rows, strict=True):
+    rows = []
+    for config, row in run_jobs(_measure, jobs, workers=workers, label="Synthetic takes"):
         numbers = ", ".join(f"{key} {value:.4g}" for key, value in row.items())
-        Console(stderr=True).print(f"{job.config.fabric}, seed {job.config.seed}: {numbers}", soft_wrap=True)
+        Console(stderr=True).print(f"{config.fabric}, seed {config.seed}: {numbers}", soft_wrap=True)
+        rows.append(row)
     with tempfile.TemporaryDirectory(prefix="capture4d-synthesis-") as scratch:
         tiny = replace(PRESETS["tiny"], frames=2, capture_every=2)
         digests = {synthesise(Path(scratch) / name, tiny, workers=1) for name in ("first", "second")}
@@ -109,7 +110,7 @@ def run(*, quick: bool = False, frames: int = 120, workers: int = 2) -> list[Met
     ]
 
 
-def _measure(job: _Job) -> dict[str, float]:
+def _measure(job: _Job) -> tuple[SynthConfig, dict[str, float]]:
     take = prepare_take(job.config)
     faces = take.shaped.body.template.faces
     started = time.process_time()
@@ -143,7 +144,7 @@ def _measure(job: _Job) -> dict[str, float]:
         row["pose_determinism_ratio"] = _determinism(job, normals) / residuals.mean()
     if job.converge_frames:
         row["hem_sag_mm"] = _hem_sag(take, clip, job.converge_frames)
-    return {key: float(value) for key, value in row.items()}
+    return job.config, {key: float(value) for key, value in row.items()}
 
 
 def _angles(first: np.ndarray, second: np.ndarray) -> np.ndarray:
