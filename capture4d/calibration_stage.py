@@ -13,10 +13,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from capture4d.calibration_board import Board, BoardView, detect_corners, parse_board
+from capture4d.calibration_board import Board, BoardView, parse_board
 from capture4d.calibration_config import CALIBRATION, RIG_CHECK, CalibrationConfig, RigCheckConfig
 from capture4d.calibration_report import calibration_report
 from capture4d.colmap_model import read_model, write_model
+from capture4d.corner_detection import detect_corners
 from capture4d.errors import InputError
 from capture4d.records import ArrayFile, load_rig, save_rig
 from capture4d.rig_calibration import calibrate_rig

@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float64, Int32
 
-from capture4d.calibration_board import Board, BoardView, detect_corners
+from capture4d.calibration_board import Board, BoardView
+from capture4d.corner_detection import detect_corners
 from capture4d.projection import project_world, rotation_from_vector, transform
 from capture4d.types import Rig
 from data_synth.board_images import DEFAULT, BoardImageConfig, photograph_board

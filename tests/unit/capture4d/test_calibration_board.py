@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from capture4d.calibration_board import detect_corners, parse_board
+from capture4d.calibration_board import parse_board
+from capture4d.corner_detection import detect_corners
 from capture4d.errors import InputError
 from data_synth.board_images import BoardImageConfig, photograph_board
 from data_synth.board_views import calibration_rig, measure_corner_errors, visible_corners, wave_board
