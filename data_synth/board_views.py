@@ -6,6 +6,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from jaxtyping import Float64, Int32
 
@@ -121,6 +123,7 @@ def measure_corner_errors(
     rng: np.random.Generator,
     config: BoardImageConfig = DEFAULT,
     images: int = 20,
+    detect: Callable[[np.ndarray, Board], tuple[np.ndarray, np.ndarray]] = detect_corners,
 ) -> list[Float64[np.ndarray, "corners 2"]]:
     """Detected less true corners, pixels, of rendered images of a rig: one array an image that shows the board."""
     pool = []
@@ -129,7 +132,7 @@ def measure_corner_errors(
         if not seeing or len(pool) == images:
             continue
         camera = int(rng.choice(seeing))
-        found, pixels = detect_corners(photograph_board(rig, camera, board, pose, rng=rng, config=config), board)
+        found, pixels = detect(photograph_board(rig, camera, board, pose, rng=rng, config=config), board)
         everywhere, _ = project_world(rig, camera, transform(pose, board.corners))
         if len(found) >= SMALLEST_VIEW:
             pool.append(pixels - everywhere[found])
