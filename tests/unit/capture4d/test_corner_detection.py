@@ -72,6 +72,13 @@ def test_the_fit_is_far_better_than_opencv(
     assert errors.max() < 0.15
 
 
+def test_equal_pictures_have_equal_corners():
+    board = parse_board("charuco:10x8:60:44:DICT_5X5_100")
+    picture, _ = tilted_view(board, DEFAULT)
+    for first, second in zip(detect_corners(picture, board), detect_corners(picture.copy(), board), strict=True):
+        np.testing.assert_array_equal(first, second)
+
+
 def test_a_corner_that_is_covered_is_left_out():
     board = parse_board("charuco:10x8:60:44:DICT_5X5_100")
     picture, truth = tilted_view(board, replace(DEFAULT, hands=0))
