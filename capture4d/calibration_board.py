@@ -1,4 +1,4 @@
-"""The ChArUco board: its geometry, and its corners in an image.
+"""The ChArUco board: its geometry, and what a camera sees of it.
 
 Board axes: the origin at the outer corner of the first square, x along the rows, y down the columns, z away from who
 looks at the printed side. Corners are numbered row by row, as OpenCV does.
@@ -6,21 +6,20 @@ looks at the printed side. Corners are numbered row by row, as OpenCV does.
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float64, Int32, UInt8
+from jaxtyping import Bool, Float64, Int32
 
 from capture4d.errors import InputError
 
-__all__ = ["Board", "BoardView", "detect_corners", "parse_board"]
+__all__ = ["LEAST_CORNERS", "Board", "BoardView", "parse_board"]
 
 EXAMPLE = "charuco:14x10:60:44:DICT_5X5_100"
-FINE_WINDOW = 5
-"""Half the side, pixels, of the square in which a corner is refined at most."""
+LEAST_CORNERS = 8
+"""Of a view that takes part."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +47,20 @@ class Board:
     @property
     def middle(self) -> Float64[np.ndarray, " 3"]:
         return np.array([self.columns * self.square_m / 2, self.rows * self.square_m / 2, 0.0])
+
+    @property
+    def cells_per_marker(self) -> int:
+        """Along a side, with the black rim."""
+        return int(self.opencv().getDictionary().markerSize) + 2
+
+    def paper_falls(self, ids: Int32[np.ndarray, " found"]) -> Bool[np.ndarray, " found"]:
+        """Whether the white squares at a corner are those top left and bottom right."""
+        inverted = self.legacy and self.rows % 2 == 0
+        return (ids % (self.columns - 1) + ids // (self.columns - 1) + inverted) % 2 == 1
+
+    def is_fixed_by(self, ids: Int32[np.ndarray, " found"]) -> bool:
+        """Whether a view of these corners tells where the board is: enough, and not all on one line of squares."""
+        return len(ids) >= LEAST_CORNERS and bool((np.ptp(self.corners[ids], axis=0)[:2] > 1.5 * self.square_m).all())
 
     def opencv(self) -> Any:
         """The cv2.aruco.CharucoBoard."""
@@ -105,28 +118,3 @@ def parse_board(spec: str) -> Board:
             f"--board: {columns}x{rows} squares need {columns * rows // 2} markers, {dictionary} has {held}"
         )
     return Board(columns, rows, square_m, marker_m, dictionary, legacy)
-
-
-def detect_corners(
-    image: UInt8[np.ndarray, "height width"], board: Board
-) -> tuple[Int32[np.ndarray, " found"], Float64[np.ndarray, "found 2"]]:
-    """Find the corners of a board in a grey image.
-
-    Returns:
-        ids: corner numbers, ascending; empty where no board is seen.
-        pixels: centres at integers.
-    """
-    corners, ids, _, _ = _detector(board).detectBoard(image)
-    if ids is None or not len(ids):
-        return np.zeros(0, np.int32), np.zeros((0, 2))
-    order = np.argsort(ids.ravel(), kind="stable")
-    return ids.ravel()[order].astype(np.int32), corners.reshape(-1, 2)[order].astype(np.float64)
-
-
-@functools.lru_cache(maxsize=4)
-def _detector(board: Board) -> Any:
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    detector = cv2.aruco.CharucoDetector(board.opencv())
-    detector.setDetectorParameters(parameters)
-    return detector

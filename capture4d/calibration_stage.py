@@ -13,10 +13,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from capture4d.calibration_board import Board, BoardView, detect_corners, parse_board
+from capture4d.calibration_board import Board, BoardView, parse_board
 from capture4d.calibration_config import CALIBRATION, RIG_CHECK, CalibrationConfig, RigCheckConfig
 from capture4d.calibration_report import calibration_report
 from capture4d.colmap_model import read_model, write_model
+from capture4d.corner_detection import detect_corners
 from capture4d.errors import InputError
 from capture4d.records import ArrayFile, load_rig, save_rig
 from capture4d.rig_calibration import calibrate_rig
@@ -28,6 +29,8 @@ __all__ = ["BoardImage", "convert", "find_images", "run", "run_check"]
 
 PATTERN = "{camera}/{pose}"
 ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+DETECTOR = "fitted pattern"
+"""Corners that an earlier detector has kept are found anew."""
 REPORT, CORNERS, COVARIANCE = "calibration.json", "calibration_corners.npz", "calibration_covariance.npz"
 
 
@@ -209,7 +212,7 @@ def _detect_all(
         values = [detections[image] for image in images]
         write_npz(
             cache,
-            board=np.array(repr(board)),
+            board=np.array(f"{board}, {DETECTOR}"),
             keys=np.array([keys[image] for image in images]),
             sizes=np.array([size for size, _, _ in values], np.int32),
             counts=np.array([len(ids) for _, ids, _ in values], np.int32),
@@ -223,7 +226,7 @@ def _read_corners(cache: Path, board: Board) -> dict[str, tuple[tuple[int, int],
     if not cache.is_file():
         return {}
     with ArrayFile(cache) as arrays:
-        if str(arrays["board"]) != repr(board):
+        if str(arrays["board"]) != f"{board}, {DETECTOR}":
             return {}
         ends = np.cumsum(arrays["counts"])[:-1]
         return {

@@ -17,7 +17,7 @@ from capture4d.rig_uncertainty import camera_covariance, robust_scale
 
 __all__ = ["Calibration", "calibrate_rig", "final_loss", "level_world"]
 
-LEAST_LOSS_PX = 0.02
+LEAST_LOSS_PX = 0.01
 """Below this a loss would only fit the rounding of the detector."""
 UPRIGHT = 0.3
 """Mean of the cameras' up vectors that is still taken for up."""

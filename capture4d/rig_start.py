@@ -20,21 +20,15 @@ from capture4d.errors import InputError
 from capture4d.rig_adjustment import RigEstimate
 from capture4d.types import Rig
 
-__all__ = ["LEAST_CORNERS", "LEAST_VIEWS", "require_connected", "start_rig", "usable_views"]
+__all__ = ["LEAST_VIEWS", "require_connected", "start_rig", "usable_views"]
 
-LEAST_CORNERS = 8
 LEAST_VIEWS = 3
 """Of one camera: Zhang's method needs two, and the noise one more."""
 
 
 def usable_views(views: Sequence[BoardView], board: Board) -> list[BoardView]:
     """Views with enough corners, and not all on one line of squares."""
-    corners = board.corners
-    return [
-        view
-        for view in views
-        if len(view.ids) >= LEAST_CORNERS and min(np.ptp(corners[view.ids, :2], axis=0)) > 1.5 * board.square_m
-    ]
+    return [view for view in views if board.is_fixed_by(view.ids)]
 
 
 def require_connected(views: Sequence[BoardView], names: Sequence[str]) -> None:

@@ -23,6 +23,11 @@ __all__ = ["DEFAULT", "BoardImageConfig", "photograph_board"]
 LENS_STEP = 4
 """The inverse of the lens is computed at every 4th pixel and interpolated, to within a thousandth of a pixel."""
 NEAREST_M = 0.05
+RAYS, RAY_STEP = 21, 13
+"""Averaged in a pixel, on a Fibonacci lattice."""
+ROW_SHIFT, COLUMN_SHIFT = (0.7548776662, 0.5698402910), (0.4142135624, 0.7320508076)
+"""Of the lattice, in x and in y, from row to row and from column to column: irrational, so that no edge runs along the
+rays. With the same rays in every pixel, edges along rows or diagonals would move corners by hundredths of a pixel."""
 BLACK = -1
 """In the table of squares: no marker, all ink."""
 
@@ -31,8 +36,6 @@ BLACK = -1
 class BoardImageConfig:
     """What stands between the board and the pixels."""
 
-    rays_per_side: int = 3
-    """Squared: rays averaged in a pixel."""
     blur_px: float = 0.7
     """Standard deviation of the lens's blur."""
     noise: float = 2.5
@@ -82,7 +85,6 @@ def photograph_board(
                 np.array([board.square_m, board.marker_m, config.margin_m, config.hand_radius_m]),
                 np.array([config.ink, config.paper, config.background]),
                 hands,
-                config.rays_per_side,
             )
     blurred = cv2.GaussianBlur(image, (0, 0), config.blur_px) if config.blur_px > 0 else image
     noisy = blurred + rng.normal(0, config.noise, blurred.shape).astype(np.float32)
@@ -128,8 +130,8 @@ def _pattern(board: Board) -> tuple[Int32[np.ndarray, "rows columns"], UInt8[np.
 
 @no_type_check  # keeps the type-checking import hook off the function that numba compiles
 @njit(cache=True)
-def _render(image, lens, T_board_camera, squares, bits, lengths, greys, hands, side):
-    """Average side x side rays in every pixel of a window."""
+def _render(image, lens, T_board_camera, squares, bits, lengths, greys, hands):
+    """Average RAYS in every pixel of a window."""
     square, marker, margin, hand = lengths
     ink, paper, skin = greys
     rows, columns = squares.shape
@@ -139,9 +141,11 @@ def _render(image, lens, T_board_camera, squares, bits, lengths, greys, hands, s
     for row in range(image.shape[0]):
         for column in range(image.shape[1]):
             total = 0.0
-            for ray in range(side * side):
-                u = (column + (ray % side + 0.5) / side) / LENS_STEP
-                v = (row + (ray // side + 0.5) / side) / LENS_STEP
+            shift_x = row * ROW_SHIFT[0] + column * COLUMN_SHIFT[0]
+            shift_y = row * ROW_SHIFT[1] + column * COLUMN_SHIFT[1]
+            for ray in range(RAYS):
+                u = (column + (ray / RAYS + shift_x) % 1.0) / LENS_STEP
+                v = (row + (ray * RAY_STEP / RAYS + shift_y) % 1.0) / LENS_STEP
                 i, j = int(v), int(u)
                 a, b = v - i, u - j
                 x = (1 - a) * ((1 - b) * lens[i, j, 0] + b * lens[i, j + 1, 0]) + a * (
@@ -183,4 +187,4 @@ def _render(image, lens, T_board_camera, squares, bits, lengths, greys, hands, s
                     total += paper
                 else:
                     total += ink
-            image[row, column] = total / (side * side)
+            image[row, column] = total / RAYS

@@ -6,10 +6,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from jaxtyping import Float64, Int32
 
-from capture4d.calibration_board import Board, BoardView, detect_corners
+from capture4d.calibration_board import Board, BoardView
+from capture4d.corner_detection import detect_corners
 from capture4d.projection import project_world, rotation_from_vector, transform
 from capture4d.types import Rig
 from data_synth.board_images import DEFAULT, BoardImageConfig, photograph_board
@@ -120,6 +123,7 @@ def measure_corner_errors(
     rng: np.random.Generator,
     config: BoardImageConfig = DEFAULT,
     images: int = 20,
+    detect: Callable[[np.ndarray, Board], tuple[np.ndarray, np.ndarray]] = detect_corners,
 ) -> list[Float64[np.ndarray, "corners 2"]]:
     """Detected less true corners, pixels, of rendered images of a rig: one array an image that shows the board."""
     pool = []
@@ -128,7 +132,7 @@ def measure_corner_errors(
         if not seeing or len(pool) == images:
             continue
         camera = int(rng.choice(seeing))
-        found, pixels = detect_corners(photograph_board(rig, camera, board, pose, rng=rng, config=config), board)
+        found, pixels = detect(photograph_board(rig, camera, board, pose, rng=rng, config=config), board)
         everywhere, _ = project_world(rig, camera, transform(pose, board.corners))
         if len(found) >= SMALLEST_VIEW:
             pool.append(pixels - everywhere[found])

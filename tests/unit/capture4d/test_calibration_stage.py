@@ -16,7 +16,7 @@ from capture4d.errors import InputError
 from capture4d.projection import rotation_from_vector
 from capture4d.records import load_rig
 from capture4d.rig_adjustment import RigEstimate
-from data_synth.board_images import BoardImageConfig, photograph_board
+from data_synth.board_images import photograph_board
 from data_synth.board_views import calibration_rig, visible_corners, wave_board
 
 SPEC = "charuco:9x7:90:68:DICT_4X4_50"
@@ -54,12 +54,11 @@ def shoot(tmp_path_factory: pytest.TempPathFactory):
     turned = rig.T_camera_world.copy()
     turned[1, :3] = rotation_from_vector(np.radians([0.15, 0.1, 0])) @ turned[1, :3]
     after = type(rig)(rig.names, rig.intrinsics, rig.distortion, turned, rig.image_sizes)
-    config = BoardImageConfig(rays_per_side=2)
     for part, these, placed in (("images", rig, poses[:-1]), ("still", rig, poses[-1:]), ("turned", after, poses[-1:])):
         for camera, name in enumerate(rig.names):
             (folder / part / name).mkdir(parents=True)
             for index, pose in enumerate(placed):
-                image = photograph_board(these, camera, board, pose, rng=rng, config=config)
+                image = photograph_board(these, camera, board, pose, rng=rng)
                 cv2.imwrite(str(folder / part / name / f"{index:03d}.png"), image)
     assert run(*calibrate(folder / "images", folder / "rig.json", "--colmap", folder / "colmap")) == 0
     return folder, rig, np.stack(poses)

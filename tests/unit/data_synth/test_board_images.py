@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from capture4d.calibration_board import detect_corners, parse_board
+from capture4d.calibration_board import parse_board
+from capture4d.corner_detection import detect_corners
 from capture4d.projection import rotation_from_vector
 from capture4d.types import Rig
 from data_synth.board_images import BoardImageConfig, photograph_board
