@@ -7,7 +7,8 @@ that contain garment colour survive, so that a hand of the border's colour does 
 A border point comes from a vertex on an open edge of what was cut out, whether the scan ends there or the next colour
 begins, that lies on the far side of the paint: along the surface it is almost a band's width away from garment colour.
 Rims of occlusion holes are nearer, or not on paint, and drop out. A scan stops short of its borders; the points are
-moved outwards by what is missing.
+moved outwards by what is missing. Where a scan goes on to the body behind, the border is found from the inner rim of
+the paint instead (`band_borders`).
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from numba import njit
 from scipy import sparse
 from scipy.sparse import csgraph
 
+from capture4d.band_borders import border_beyond_rim
 from capture4d.border_loops import straighten
 from capture4d.errors import InputError
 from capture4d.mesh_kernels import face_components, open_vertices
@@ -56,7 +58,7 @@ FAR_SIDE = 0.6
 EROSION = 0.9
 """Sample spacings by which fused scans stop short of an open border (measured against the synthetic scanner)."""
 CONNECTED = 0.2
-"""Share of a border's open vertices where the scan goes on, above which the border is where the paint ends."""
+"""Share of a border's open vertices where the scan goes on, above which the border is found from the inner rim."""
 STRAIGHTENED = 3.0
 """Border points are drawn to the line through their neighbours within so many sample spacings."""
 EVEN_BAND = 2.0
@@ -209,9 +211,10 @@ def _border_points(
     Args:
         goes_on: vertices where the scan goes on beyond what was cut out.
 
-    Where the scan mostly goes on, the border is where the paint ends, a band's width from garment colour along the
-    surface. Where it ends there, it ends about a sample before the surface does, and sometimes several: if the band is
-    of even width, each open vertex is moved outwards by what is missing from that width; else by the one sample.
+    Where the scan mostly goes on, the border is found from the inner rim of the paint (`band_borders`), because the
+    outer one bends to what is behind it. Where it ends there, it ends about a sample before the surface does, and
+    sometimes several: if the band is of even width, each open vertex is moved outwards by what is missing from that
+    width; else by the one sample.
     """
     points, labels_of = [np.zeros((0, 3), np.float32)], [np.zeros(0, labels.dtype)]
     if not paints:
@@ -229,21 +232,15 @@ def _border_points(
         if not len(own):
             continue
         own = own[straight[own] >= FAR_SIDE * np.percentile(straight[own], 75)]
-        found = []
         if ends[own].mean() > CONNECTED:
-            walked = band.distance[band.rim_here]
-            width = float(np.percentile(walked[own[ends[own]]], 40))
-            found.append(band.crossings(width, labels[band.vertices] == paint))
-            own = own[(walked[own] < width) & (walked[own] > FAR_SIDE * width)]
-            missing = np.clip(width - walked[own], 0.0, 2.5 * spacing)
+            found = border_beyond_rim(mesh, labels == GARMENT, labels == paint)
         else:
             narrow, full = np.percentile(straight[own], (20, 90))
             missing = np.full(len(own), EROSION * spacing)
             if full - narrow < EVEN_BAND * spacing:
                 missing = np.clip(full + 0.2 * spacing - straight[own], 0.0, 2.5 * spacing)
-        direction = across[own] / straight[own, None]
-        found.append(outer[own] + missing[:, None] * direction)
-        points.append(straighten(np.concatenate(found), STRAIGHTENED * spacing).astype(np.float32))
+            found = outer[own] + (missing / straight[own])[:, None] * across[own]
+        points.append(straighten(found, STRAIGHTENED * spacing).astype(np.float32))
         labels_of.append(np.full(len(points[-1]), paint, labels.dtype))
     return np.concatenate(points), np.concatenate(labels_of)
 
@@ -260,11 +257,6 @@ class _Band:
 
     vertices: np.ndarray
     """Of the mesh: the paint and its neighbours."""
-    positions: np.ndarray
-    edges: np.ndarray
-    """(E, 2) into `vertices`."""
-    distance: np.ndarray
-    """To garment colour, along the edges of the mesh; infinite where the paint is not connected to any."""
     nearest: np.ndarray
     """Position of the garment vertex there."""
     rim_here: np.ndarray
@@ -273,15 +265,6 @@ class _Band:
     @property
     def rim(self) -> np.ndarray:
         return self.vertices[self.rim_here]
-
-    def crossings(self, distance: float, chosen: np.ndarray) -> np.ndarray:
-        """(C, 3) points on the edges between chosen vertices at which the distance is so large."""
-        start, end = self.edges[chosen[self.edges].all(axis=1)].T
-        near, far = self.distance[start], self.distance[end]
-        passes = ((near < distance) != (far < distance)) & np.isfinite(near) & np.isfinite(far)
-        share = (distance - near[passes]) / (far[passes] - near[passes])
-        first = self.positions[start[passes]]
-        return first + share[:, None] * (self.positions[end[passes]] - first)
 
 
 def _across_the_paint(mesh: Mesh, labels: np.ndarray) -> _Band:
@@ -297,13 +280,11 @@ def _across_the_paint(mesh: Mesh, labels: np.ndarray) -> _Band:
     length = np.maximum(np.linalg.norm(positions[start] - positions[end], axis=1), 1e-9)
     graph = sparse.csr_array((length, (start, end)), shape=(len(local), len(local)))
     sources = np.flatnonzero(~painted[local])
-    distance, source = np.full(len(local), np.inf), np.full(len(local), -1)
+    source = np.full(len(local), -1)
     if len(sources):
-        distance, _, source = csgraph.dijkstra(
-            graph, directed=False, indices=sources, min_only=True, return_predecessors=True
-        )
+        _, _, source = csgraph.dijkstra(graph, directed=False, indices=sources, min_only=True, return_predecessors=True)
     rim = np.flatnonzero(is_open[local] & painted[local] & (source >= 0))
-    return _Band(local, positions, np.stack([start, end], axis=1), distance, positions[source], rim)
+    return _Band(local, positions[source], rim)
 
 
 def _loops_of_paints(boundary_colours: Mapping[str, Colour], paints: tuple[Colour, ...]) -> np.ndarray:
