@@ -28,6 +28,7 @@ from capture4d.garment_extraction import classify_colours, settle_labels
 from capture4d.garment_stage import load_garment_scan
 from capture4d.records import ArrayFile, load_poses
 from capture4d.scans import Capture, read_rig, read_scan
+from capture4d.take_colours import KnownColours, take_colours
 from capture4d.types import Mesh, PoseSequence, RegisteredSequence
 from capture4d.workdir import read_json, run_jobs
 
@@ -184,7 +185,9 @@ def draw_stages(
 ) -> list[StagePictures]:
     """What was cut out and what was tracked, in the frames at these positions."""
     loops = {int(row): _loop_places(registered, row) for row in rows}
-    draw = partial(_draw_row, work, capture, loops)
+    extraction = work / "garment" / "colours.json"
+    learned = extraction.is_file() and bool(read_json(extraction)["learned"])
+    draw = partial(_draw_row, work, capture, take_colours(capture, learn=learned), loops)
     return sorted(run_jobs(draw, list(rows), workers=workers, label="draw stages"), key=lambda each: each.row)
 
 
@@ -192,11 +195,14 @@ def _loop_places(registered: RegisteredSequence, row: int) -> list[np.ndarray]:
     return [np.array(registered.vertices[row][loop]) for loop in registered.garment.loops.values()]
 
 
-def _draw_row(work: Path, capture: Capture, loops: Mapping[int, list[np.ndarray]], row: int) -> StagePictures:
+def _draw_row(
+    work: Path, capture: Capture, colours: KnownColours, loops: Mapping[int, list[np.ndarray]], row: int
+) -> StagePictures:
     frame_id = capture.frame_ids[row]
     scan = read_scan(capture, frame_id)
-    paints = tuple(dict.fromkeys(capture.boundary_colours.values()))
-    labels = settle_labels(scan.mesh.faces, classify_colours(scan.colours, capture.garment_colour, paints))
+    paints = tuple(dict.fromkeys(colours.boundary.values()))
+    found = classify_colours(colours.flat(scan).colours, colours.garment, paints, others=colours.others)
+    labels = settle_labels(scan.mesh.faces, found)
     painted = LABELS[np.minimum(labels, 2)]
     cloth = scan.mesh.vertices[labels > 0] if (labels > 0).any() else scan.mesh.vertices
     borders = _border_dots(work / "garment" / "frames" / f"{frame_id:06d}.npz", frame_id, loops[row])
