@@ -170,7 +170,7 @@ def _dense_stage(
     )
     reference = analysis.laplacian_rows.apply(vertices[:, :, None])
     lengths = analysis.rest_lengths
-    if near and config.dense.fold_lengths:
+    if schedule.steps and near and config.dense.fold_lengths:
         lengths = folded_lengths(
             scan.surface, vertices, analysis.faces, analysis.edges, analysis.edge_faces, analysis.rest_lengths
         )
