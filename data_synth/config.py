@@ -95,9 +95,9 @@ class SimulationConfig:
     its seat. 0 leaves the sheet free, and its folds at the shoulders to its history."""
     hold_depth_m: float = 0.09
     """How far below the shoulders the hold has fallen to a third of the way to `hold_floor`."""
-    hold_floor: float = 0.035
+    hold_floor: float = 0.045
     """Share of the hold far below the shoulders."""
-    hold_ripple_m: float = 0.005
+    hold_ripple_m: float = 0.006
     """Standard deviation of the fixed bumps of that place, metres. They say which way the cloth buckles when the arms
     go up; without them a tenth of a millimetre decides, and two runs that had met part again."""
     hold_ripple_width_m: tuple[float, float] = (0.012, 0.02)

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from capture4d.body import PosedBody, ShapedBody, skin, unskin, with_pose
 from capture4d.garment_binding import bind
-from capture4d.mesh import vertex_normals
+from capture4d.mesh import unique_edges, vertex_normals
 from capture4d.open3d_loading import import_open3d
 from capture4d.types import PoseSequence
 from capture4d.warp_loading import import_warp
@@ -99,6 +99,7 @@ def dress(shaped: ShapedBody, mesh: PanelMesh, pattern: Pattern, first: PosedBod
         arm = surface[(sign * surface[:, 0] > half) & (sign * surface[:, 0] < half + 0.12)]
         placed[rows] = _tube(draft[rows], arm, sign, half)
     placed = _push_outside(placed, surface, shaped.body.template.faces, clearance=0.008)
+    placed = _push_edges_outside(placed, unique_edges(mesh.faces), surface, shaped.body.template.faces)
     # Where panels coincide triangles have no area, and newton would leave them out.
     placed += np.random.default_rng(0).normal(scale=2e-4, size=placed.shape)
     root = first.transforms[0]
@@ -144,6 +145,28 @@ def _push_outside_along(
         if not near.any():
             break
         points[near, 2] += sign * 0.5 * clearance
+    return points
+
+
+def _push_edges_outside(points: np.ndarray, edges: np.ndarray, surface: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Move the ends, (V, 3), of edges, (E, 2), that cut into the surface, until none does or 60 steps are made."""
+    shares = np.array([0.25, 0.5, 0.75])[:, None]
+    points, low = points.copy(), np.arange(len(edges))
+    for _ in range(60):
+        start, end = points[edges[low]].transpose(1, 0, 2)
+        samples = start[:, None] * (1 - shares) + end[:, None] * shares
+        heights, _, normals = _heights(samples.reshape(-1, 3), surface, faces)
+        heights, normals = heights.reshape(-1, 3), normals.reshape(-1, 3, 3)
+        rows, deepest = np.arange(len(low)), np.argmin(heights, axis=1)
+        inside = heights[rows, deepest] < 0
+        if not inside.any():
+            break
+        rows, deepest = rows[inside], deepest[inside]
+        step = (0.002 - heights[rows, deepest])[:, None] * normals[rows, deepest]
+        push = np.zeros((len(points), 4))
+        np.add.at(push, edges[low[rows]], np.column_stack([step, np.ones(len(rows))])[:, None])
+        points += push[:, :3] / np.maximum(push[:, 3:], 1)
+        low = np.flatnonzero((push[edges, 3] > 0).any(axis=1))
     return points
 
 

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from capture4d.body import ShapedBody, unskin
+from capture4d.mesh import unique_edges
 from data_synth.config import Fabric, GarmentStyle, MotionConfig, SimulationConfig
 from data_synth.motions import make_motion
 from data_synth.patterns import mesh_pattern, tshirt_pattern
 from data_synth.simulation import approach_poses, dress, simulate
 from data_synth.template import bind_template
+from data_synth.wrinkle_relaxation import body_planes
 
 SETTINGS = SimulationConfig(vertices=500, calm_frames=12, approach_frames=6, rest_frames=2)
 
@@ -25,6 +27,20 @@ def simulated(person: ShapedBody):
     bodies = approach_poses(person, poses, SETTINGS)
     start = dress(person, mesh, pattern, bodies[0])
     return mesh, bodies, start, list(simulate(mesh, start, bodies, Fabric(), SETTINGS))
+
+
+@pytest.mark.parametrize("ease", [0.12, 0.3])
+@pytest.mark.parametrize("vertices", [500, 1500])
+def test_no_edge_of_the_hung_panels_runs_through_the_body(person: ShapedBody, ease: float, vertices: int) -> None:
+    pattern = tshirt_pattern(person, GarmentStyle(ease=ease))
+    mesh = mesh_pattern(pattern, vertices, np.random.default_rng(0))
+    poses = make_motion(person, MotionConfig("twist"), 60.0, 1, np.random.default_rng(0))
+    body = approach_poses(person, poses, SETTINGS)[0]
+    start, end = dress(person, mesh, pattern, body)[unique_edges(mesh.faces)].transpose(1, 0, 2)
+    samples = np.concatenate([start + share * (end - start) for share in np.linspace(0, 1, 9)])
+    planes = body_planes(samples, body.vertices(), person.body.template.faces)
+    depth = -np.einsum("vc,vc->v", samples - planes.points, planes.normals)
+    assert depth.max() < 0.015, "limbs are tubes of 45 mm radius: deeper, and the edge runs through them"
 
 
 @pytest.mark.slow
