@@ -217,7 +217,8 @@ def simulate(
             if hold is not None and held is not None:
                 places = (1 - blend) * held[0] + blend * held[1]
                 state.particle_f.assign((hold.stiffness * (places - state.particle_q.numpy())).astype(np.float32))
-            pipeline.collide(state, contacts)
+            if substep % config.contact_substeps == 0:
+                pipeline.collide(state, contacts)
             solver.step(state, scratch, control, contacts, step)
             state, scratch = scratch, state
             keep = config.calm_damping if calm else config.damping
