@@ -15,6 +15,7 @@ Boubekeur and Alexa (2008).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -164,14 +165,43 @@ def lift(mesh: WrinkleMesh, coarse: np.ndarray, smoothing: float = 0.6) -> tuple
 
 def body_planes(points: np.ndarray, surface: np.ndarray, faces: np.ndarray) -> BodyPlanes:
     """Nearest body point and smooth normal for each cloth point."""
-    scene = import_open3d().t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(surface.astype(np.float32), faces.astype(np.uint32))
-    closest = scene.compute_closest_points(points.astype(np.float32))
-    uv = closest["primitive_uvs"].numpy()
-    corners = faces[closest["primitive_ids"].numpy()]
-    weights = np.column_stack([1 - uv.sum(axis=1), uv])
-    normals = np.einsum("vk,vkc->vc", weights, vertex_normals(surface, faces)[corners])
-    return BodyPlanes(closest["points"].numpy(), normals / np.linalg.norm(normals, axis=1, keepdims=True))
+    return _BodySurface.create(surface, faces).planes(points)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _BodySurface:
+    """A posed body that is looked up several times."""
+
+    scene: Any
+    faces: np.ndarray
+    normals: np.ndarray
+
+    @staticmethod
+    def create(surface: np.ndarray, faces: np.ndarray) -> _BodySurface:
+        scene = import_open3d().t.geometry.RaycastingScene(nthreads=1)
+        scene.add_triangles(surface.astype(np.float32), faces.astype(np.uint32))
+        return _BodySurface(scene, faces, vertex_normals(surface, faces))
+
+    def planes(self, points: np.ndarray) -> BodyPlanes:
+        closest = self.scene.compute_closest_points(points.astype(np.float32))
+        uv = closest["primitive_uvs"].numpy()
+        corners = self.faces[closest["primitive_ids"].numpy()]
+        weights = np.column_stack([1 - uv.sum(axis=1), uv])
+        normals = np.einsum("vk,vkc->vc", weights, self.normals[corners])
+        return BodyPlanes(closest["points"].numpy(), normals / np.linalg.norm(normals, axis=1, keepdims=True))
+
+
+def _may_touch(mesh: WrinkleMesh, coarse: np.ndarray, base: np.ndarray, body: _BodySurface, reach: float) -> np.ndarray:
+    """Which fine vertices may lie within `reach` of the body, (n,); four in ten do not, and are not looked up.
+
+    A vertex is no nearer to the body than a coarse vertex beside it less the way between them.
+    """
+    planes = body.planes(coarse)
+    away = coarse - planes.points
+    outside = np.einsum("vc,vc->v", away, planes.normals) > 0
+    distance = np.where(outside, np.linalg.norm(away, axis=1), 0)[mesh.lift_vertices]
+    way = np.linalg.norm(base[:, None] - coarse[mesh.lift_vertices], axis=2)
+    return np.flatnonzero((distance - way).max(axis=1) < reach)
 
 
 def relax_frame(
@@ -202,8 +232,12 @@ def relax_frame(
     else:
         offsets = config.warm_start * previous_offsets + (1 - config.warm_start) * offsets
     points = (base + np.einsum("vji,vj->vi", frames, offsets)).astype(np.float32)
+    body = _BodySurface.create(surface, body_faces)
+    near = _may_touch(mesh, coarse, base, body, config.radius_m + 2 * config.body_margin_m)
+    plane_points, plane_normals = (base - normals).astype(np.float32), normals.astype(np.float32)  # out of the way
     for planes_at in (base, points):  # the body is a half plane per vertex, so it is looked up again half-way
-        planes = body_planes(planes_at, surface, body_faces)
+        planes = body.planes(planes_at[near])
+        plane_points[near], plane_normals[near] = planes.points, planes.normals
         _relax(
             points,
             base.astype(np.float32),
@@ -216,14 +250,14 @@ def relax_frame(
             np.float32(config.pull_normal),
             np.float32(config.pull_tangential),
             np.float32(config.radius_m),
-            planes.points.astype(np.float32),
-            planes.normals.astype(np.float32),
+            plane_points,
+            plane_normals,
             np.float32(config.body_margin_m),
             (sweeps + 1) // 2,
         )
-    planes = body_planes(points, surface, body_faces)
-    depth = np.einsum("vc,vc->v", points - planes.points, planes.normals) - 0.2 * config.body_margin_m
-    points -= (np.minimum(depth, 0)[:, None] * planes.normals).astype(np.float32)
+    planes = body.planes(points[near])
+    depth = np.einsum("vc,vc->v", points[near] - planes.points, planes.normals) - 0.2 * config.body_margin_m
+    points[near] -= (np.minimum(depth, 0)[:, None] * planes.normals).astype(np.float32)
     return points, np.einsum("vij,vj->vi", frames, points - base).astype(np.float32)
 
 
