@@ -78,8 +78,6 @@ class SimulationConfig:
     substeps: int = 32
     """Steps a frame. Many short ones converge far better than many iterations: at equal cost the hem of 24 x 2
     hangs 3 mm higher than that of 16 x 3."""
-    calm_substeps: int = 16
-    """Steps a frame while the panels close on the body."""
     iterations: int = 2
     """Vertex block descent sweeps a substep."""
     calm_frames: int = 18
@@ -181,7 +179,6 @@ PRESETS: dict[str, SynthConfig] = {
         simulation=SimulationConfig(
             vertices=1600,
             substeps=12,
-            calm_substeps=12,
             iterations=3,
             damping=0.97,
             calm_frames=18,

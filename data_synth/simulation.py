@@ -194,6 +194,7 @@ def simulate(
     pipeline = newton.CollisionPipeline(model, soft_contact_gap=config.contact_gap_m)
     contacts, control = pipeline.contacts(), model.control()
     state, scratch = model.state(), model.state()
+    step = 1 / config.fps / config.substeps
     gravity = np.array([0.0, -9.81, 0.0], np.float32)
     hold: _Hold | None = None
     yield start
@@ -206,10 +207,8 @@ def simulate(
         held = None if hold is None else (hold.places(bodies[frame - 1]), hold.places(bodies[frame]))
         calm = frame <= config.calm_frames
         model.set_gravity(tuple(gravity * (0.5 if calm else 1.0)))
-        substeps = config.calm_substeps if calm else config.substeps
-        step = 1 / config.fps / substeps
-        for substep in range(substeps):
-            blend = (substep + 1) / substeps
+        for substep in range(config.substeps):
+            blend = (substep + 1) / config.substeps
             body.mesh.points.assign(((1 - blend) * previous + blend * current).astype(np.float32))
             body.mesh.refit()
             if body.mesh.velocities is not None:
