@@ -60,7 +60,8 @@ def refine_disparity(
     """
     seen_left, seen_right = (cv2.GaussianBlur(image.astype(np.float32), (0, 0), BLUR) for image in (left, right))
     slope = cv2.Sobel(seen_right, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
-    rows, columns = np.indices(disparity.shape).astype(np.float32)
+    grid = np.indices(disparity.shape)
+    rows, columns = grid[0].astype(np.float32), grid[1].astype(np.float32)
     colours = np.ascontiguousarray(colours)
     found = disparity
     for _ in range(steps):
