@@ -3,7 +3,7 @@
 A scan that fuses a hem with the body behind it bends the outer half of the painted band towards that body, and loses
 pieces of it. The inner rim, where garment colour meets paint, is sound. A plane is fitted to the surface on both sides
 of each point of the rim, and the border lies on it, a band's width beyond the rim. The band's width is learned where
-the band is flat: the farthest that paint is seen there.
+the band is flat: the median way to where the paint changes to another colour.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from scipy.sparse import csgraph
 from scipy.spatial import KDTree
 
 from capture4d.border_loops import straighten
-from capture4d.mesh_kernels import open_vertices
 from capture4d.types import Mesh
 
 __all__ = ["border_beyond_rim"]
@@ -29,9 +28,7 @@ AVERAGED = 0.75
 OUTLIER_M, ROUNDS = 0.0008, 2
 """Scale and rounds of the Cauchy weights of the planes."""
 FLAT_M = 0.0012
-"""Paint within this distance of its plane tells the width of the band."""
-FARTHEST_PERCENTILE = 88.0
-"""Of the paint's open vertices on flat pieces of the band: where the paint ends. Holes end nearer, strays farther."""
+"""Ends of the paint within this distance of their plane tell the width of the band."""
 MIN_REACH = 0.6
 """Rims from which the paint extends less than this share of the band's width are those of patches and shadows."""
 LARGEST_WIDTH_M = 0.04
@@ -49,8 +46,12 @@ class _Strip:
     """To the rim along the surface, metres; negative on the garment."""
     nearest: np.ndarray
     """(V,) index of the nearest rim point, along the surface."""
-    ends: Bool[np.ndarray, " verts"]
-    """Paint at an open edge."""
+    ends: Float64[np.ndarray, "ends 3"]
+    """Where the paint ends."""
+    ends_nearest: np.ndarray
+    """(E,) index of the nearest rim point, along the surface."""
+    ends_distance: Float64[np.ndarray, " ends"]
+    """To the rim along the surface, metres."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,13 +84,13 @@ def border_beyond_rim(
     """Points on the border beyond a painted band of even width, one for each edge from garment to paint.
 
     Args:
-        mesh: what was cut out of a scan.
+        mesh: a scan that goes on beyond the border.
         garment, painted: its vertices of garment colour, and of one paint.
     """
     strip = _strip(mesh, garment, painted)
-    if strip is None or strip.ends.sum() < 3:
+    if strip is None or len(strip.ends) < 3:
         return np.zeros((0, 3))
-    rough = float(np.median(strip.distance[strip.ends]))
+    rough = float(np.median(strip.ends_distance))
     planes = _planes(strip, rough)
     width = _width(strip, planes, rough)
     reached = _reach(strip, AVERAGED * rough) >= MIN_REACH * width
@@ -127,14 +128,28 @@ def _strip(mesh: Mesh, garment: np.ndarray, painted: np.ndarray) -> _Strip | Non
         graph, directed=False, indices=sources, min_only=True, return_predecessors=True, limit=LARGEST_WIDTH_M
     )
     linked = np.flatnonzero(np.isfinite(distance[: len(local)]))
-    is_open, _ = open_vertices(mesh.faces, len(mesh.vertices))
+    ends, inner = _ends(mesh, garment, painted)
+    place = np.full(len(mesh.vertices), -1)
+    place[local[linked]] = linked
+    ends, inner = ends[place[inner] >= 0], place[inner[place[inner] >= 0]]
     return _Strip(
         rim=(positions[first] + positions[second]) / 2,
         positions=positions[linked],
         distance=np.where(paint, distance[: len(local)], -distance[: len(local)])[linked],
         nearest=source[linked] - len(local),
-        ends=(paint & is_open[local])[linked],
+        ends=ends,
+        ends_nearest=source[inner] - len(local),
+        ends_distance=distance[inner] + np.linalg.norm(ends - positions[inner], axis=1),
     )
+
+
+def _ends(mesh: Mesh, garment: np.ndarray, painted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Midpoints of the edges from paint to what is neither paint nor garment, and the painted vertex of each."""
+    others = ~(garment | painted)
+    faces = mesh.faces[painted[mesh.faces].any(axis=1) & others[mesh.faces].any(axis=1)]
+    edges = np.concatenate([faces[:, [a, b]] for a, b in ((0, 1), (1, 2), (2, 0), (1, 0), (2, 1), (0, 2))])
+    edges = np.unique(edges[painted[edges[:, 0]] & others[edges[:, 1]]], axis=0)
+    return mesh.vertices[edges].astype(np.float64).mean(axis=1), edges[:, 0]
 
 
 def _planes(strip: _Strip, width_m: float) -> _Planes:
@@ -181,10 +196,9 @@ def _summed(values: np.ndarray, weight: np.ndarray, row: np.ndarray, count: int)
 
 
 def _width(strip: _Strip, planes: _Planes, rough_m: float) -> float:
-    ends = np.flatnonzero(strip.ends)
-    along, height = planes.coordinates(strip.positions[ends], strip.nearest[ends])
+    along, height = planes.coordinates(strip.ends, strip.ends_nearest)
     flat = along[(np.abs(height) < FLAT_M) & (along > rough_m / 2)]
-    return float(np.percentile(flat, FARTHEST_PERCENTILE)) if len(flat) >= 20 else rough_m
+    return float(np.median(flat)) if len(flat) >= 20 else rough_m
 
 
 def _reach(strip: _Strip, near_m: float) -> Float64[np.ndarray, " rim"]:

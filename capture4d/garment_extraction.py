@@ -26,6 +26,7 @@ from scipy.sparse import csgraph
 from capture4d.band_borders import border_beyond_rim
 from capture4d.border_loops import straighten
 from capture4d.errors import InputError
+from capture4d.label_edges import sharpen_labels
 from capture4d.mesh_kernels import face_components, open_vertices
 from capture4d.types import GarmentScan, Mesh, Scan
 
@@ -102,8 +103,8 @@ def extract_garment(
     renumbered = (np.cumsum(used) - 1).astype(np.int32)
     mesh = Mesh(scan.mesh.vertices[used], renumbered[faces[mask]])
     kept = labels[used]
-    goes_on = ~open_vertices(faces, len(labels))[0][used]
-    points, paint = _border_points(mesh, kept, len(paints), goes_on)
+    whole = _Whole(scan, np.where(used, labels, OTHER), ~open_vertices(faces, len(labels))[0][used])
+    points, paint = _border_points(mesh, kept, len(paints), whole)
     loop_of_paint = _loops_of_paints(boundary_colours, paints)
     return GarmentScan(
         mesh=mesh,
@@ -203,13 +204,24 @@ def _garment_faces(faces: np.ndarray, labels: np.ndarray) -> np.ndarray:
     return inside & keep[np.maximum(part, 0)]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Whole:
+    """The scan that a garment was cut out of."""
+
+    scan: Scan
+    labels: np.ndarray
+    """(V,) of its vertices; those that were not cut out are OTHER."""
+    goes_on: np.ndarray
+    """Vertices of what was cut out around which the scan has no open edge."""
+
+
 def _border_points(
-    mesh: Mesh, labels: np.ndarray, paints: int, goes_on: np.ndarray | None = None
+    mesh: Mesh, labels: np.ndarray, paints: int, whole: _Whole | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points on the true border, float32, and the paint of each.
 
     Args:
-        goes_on: vertices where the scan goes on beyond what was cut out.
+        whole: what `mesh` was cut out of; None if it is all there is.
 
     Where the scan mostly goes on, the border is found from the inner rim of the paint (`band_borders`), because the
     outer one bends to what is behind it. Where it ends there, it ends about a sample before the surface does, and
@@ -226,14 +238,15 @@ def _border_points(
     straight = np.linalg.norm(across, axis=1)
     spacing = _spacing(mesh)
     paint_here = labels[rim]
-    ends = np.zeros(len(rim), bool) if goes_on is None else goes_on[rim]
+    ends = np.zeros(len(rim), bool) if whole is None else whole.goes_on[rim]
     for paint in range(FIRST_PAINT, FIRST_PAINT + paints):
         own = np.flatnonzero(paint_here == paint)
         if not len(own):
             continue
         own = own[straight[own] >= FAR_SIDE * np.percentile(straight[own], 75)]
-        if ends[own].mean() > CONNECTED:
-            found = border_beyond_rim(mesh, labels == GARMENT, labels == paint)
+        if whole is not None and ends[own].mean() > CONNECTED:
+            sharp = sharpen_labels(whole.scan.mesh, whole.scan.colours, whole.labels)
+            found = border_beyond_rim(whole.scan.mesh, sharp == GARMENT, sharp == paint)
         else:
             narrow, full = np.percentile(straight[own], (20, 90))
             missing = np.full(len(own), EROSION * spacing)

@@ -101,15 +101,16 @@ def _scan_stereo(
     )
     for left in range(0, len(rig.names), 2):
         pair = speckle_pair(bare, rig, left, config=config.stereo, rng=rng)
-        depth = match_pair(pair, config=config.stereo)
         gain = 1 + config.shading.camera_gain * rng.standard_normal()
-        noise = config.shading.pixel_noise * rng.standard_normal((*depth.shape, 3), dtype=np.float32)
-        colours = np.full((*depth.shape, 3), BACKDROP, np.float32)
+        noise = config.shading.pixel_noise * rng.standard_normal((*pair.left.shape, 3), dtype=np.float32)
+        colours = np.full((*pair.left.shape, 3), BACKDROP, np.float32)
         images = lit.view(rig, left)
         if images is not None:
             rows, columns = images.window
             colours[rows, columns] = np.where((images.surface == NOTHING)[..., None], BACKDROP, images.colours)
-        volume.add(depth, (gain * colours + noise).astype(np.float32), rig.intrinsics[left], rig.T_camera_world[left])
+        colours = (gain * colours + noise).astype(np.float32)
+        depth = match_pair(pair, colours, config=config.stereo)
+        volume.add(depth, colours, rig.intrinsics[left], rig.T_camera_world[left])
     mesh, colours = volume.extract()
     return Scan(mesh, colours, frame_id, time_s), _nearest_labels(surfaces, mesh.vertices)
 

@@ -131,7 +131,7 @@ class StereoConfig:
     """Smaller islands of disparity are dropped."""
     refinement_steps: int = 4
     """Of the matches, on the intensities. Semi-global matching alone is up to 0.3 pixels off, towards whole ones; 4
-    steps leave 0.06. 0 leaves it out."""
+    steps leave less than 0.1 on a wall. 0 leaves it out."""
     lost_intensity: float = 0.02
     """Darker pixels, 1 = full scale, are not matched: background, and what the projector does not reach."""
     step_m: float = 0.012

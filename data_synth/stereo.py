@@ -3,7 +3,7 @@
 The projector stands between the cameras. Its light obeys Lambert's law, falls off with the square of the distance, and
 does not reach what lies in its shadow. Images are blurred, noisy and 8 bit; pairs are matched by semi-global matching
 with its usual faults: silhouettes grow, wrong matches fly about, and where the pattern does not reach there is a hole.
-Its preference for whole pixels can be taken back by a refinement on the intensities.
+Its preference for whole pixels is taken back by a refinement on the intensities (`disparity_refinement`).
 
 References: Hirschmueller, Stereo processing by semiglobal matching and mutual information (PAMI 2008); OpenCV's
 StereoSGBM.
@@ -16,10 +16,11 @@ from functools import cache
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Float32, UInt8
 
 from capture4d.types import Rig
 from data_synth.depth_noise import periodic_gaussian_field, silhouettes
+from data_synth.disparity_refinement import refine_disparity
 from data_synth.raycast import CameraImages, SurfaceScene
 from data_synth.scanner_config import StereoConfig
 
@@ -31,8 +32,6 @@ EXPOSURE = 0.6
 """Of full scale, for the brightest hundredth of the subject."""
 BACKDROP = 0.006
 """Light from the room, relative to the projector's, head-on at the pod's target."""
-REFINE_BLUR, REFINE_WINDOW = 0.7, 9
-"""Of the sub-pixel refinement, pixels."""
 NEAREST, FARTHEST = 0.58, 1.42
 """Depths that are searched, relative to that of the pod's target; the rig's spheres end at 0.6 and 1.4."""
 
@@ -151,8 +150,14 @@ def _exposed(radiance: np.ndarray, config: StereoConfig, rng: np.random.Generato
     return np.clip(np.rint(255 / config.full_well * noisy), 0, 255).astype(np.uint8)
 
 
-def match_pair(pair: SpecklePair, *, config: StereoConfig) -> Float32[np.ndarray, "h w"]:
-    """Depth in the left camera, metres, cleaned; 0 where nothing is matched."""
+def match_pair(
+    pair: SpecklePair, colours: Float32[np.ndarray, "h w 3"], *, config: StereoConfig
+) -> Float32[np.ndarray, "h w"]:
+    """Depth in the left camera, metres, cleaned; 0 where nothing is matched.
+
+    Args:
+        colours: of the left camera under white light, 1 = full scale; they guide the refinement of the matches.
+    """
     scale = pair.focal_px * pair.baseline_m
     lowest, highest = (scale * (1 / (share * pair.target_m) - 1 / pair.target_m) for share in (FARTHEST, NEAREST))
     first = int(np.floor(lowest))
@@ -174,34 +179,10 @@ def match_pair(pair: SpecklePair, *, config: StereoConfig) -> Float32[np.ndarray
     found = matcher.compute(wide[0], wide[1])[:, before : before + pair.left.shape[1]]
     matched = found > 16 * first
     disparity = np.where(matched, found.astype(np.float32) / 16, np.float32(0))
-    disparity = _refined(disparity, matched, pair, steps=config.refinement_steps)
+    disparity = refine_disparity(disparity, matched, pair.left, pair.right, colours, steps=config.refinement_steps)
     bright = cv2.blur(pair.left, (5, 5)) > 255 * config.lost_intensity
     depth = scale / (disparity + scale / pair.target_m)
     return _cleaned(np.where(matched & bright, depth, 0).astype(np.float32), config.step_m)
-
-
-def _refined(
-    disparity: Float32[np.ndarray, "h w"], matched: Bool[np.ndarray, "h w"], pair: SpecklePair, *, steps: int
-) -> Float32[np.ndarray, "h w"]:
-    """Gauss-Newton steps on the intensities of each pixel's window; semi-global matching prefers whole pixels."""
-    left, right = (cv2.GaussianBlur(image.astype(np.float32), (0, 0), REFINE_BLUR) for image in (pair.left, pair.right))
-    slope = cv2.Sobel(right, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
-    rows, columns = _pixel_grid(disparity.shape)
-    share = np.maximum(_window_mean(matched.astype(np.float32)), 1e-6)
-    moved = disparity
-    for _ in range(steps):
-        seen_at = columns - moved
-        residual = left - cv2.remap(right, seen_at, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        gradient = cv2.remap(slope, seen_at, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        residual, gradient = (np.where(matched, image, np.float32(0)) for image in (residual, gradient))
-        residual -= _window_mean(residual) / share * matched
-        step = _window_mean(gradient * residual) / np.maximum(_window_mean(gradient * gradient), 1e-3)
-        moved = np.clip(moved - step, disparity - 0.75, disparity + 0.75)
-    return moved
-
-
-def _window_mean(image: np.ndarray) -> np.ndarray:
-    return cv2.boxFilter(image, -1, (REFINE_WINDOW, REFINE_WINDOW))
 
 
 def _cleaned(depth: np.ndarray, step_m: float) -> Float32[np.ndarray, "h w"]:

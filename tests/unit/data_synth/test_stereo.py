@@ -12,7 +12,7 @@ from data_synth.raycast import Surface, SurfaceScene
 from data_synth.rig import look_at, pod_rig
 from data_synth.scanner import LABEL_BODY, LABEL_BORDER, LABEL_GARMENT, scan_surfaces
 from data_synth.scanner_config import FusionConfig, ScannerConfig, StereoConfig
-from data_synth.stereo import match_pair, speckle_pair
+from data_synth.stereo import SpecklePair, match_pair, speckle_pair
 
 POD = StereoConfig(pods=4, image_size=320, supersampling=1, speckle_window_px=60)
 WHITE = (200, 200, 200)
@@ -57,6 +57,11 @@ def front_pod(distance: float) -> Rig:
     intrinsics = rig.intrinsics[:2].copy()
     intrinsics[:, 0, 2] = middle + focal * np.array([-0.1, 0.1]) / distance
     return Rig(rig.names[:2], intrinsics, rig.distortion[:2], transforms, rig.image_sizes[:2])
+
+
+def grey(pair: SpecklePair) -> np.ndarray:
+    """Of one colour, so that it guides nothing."""
+    return np.full((*pair.left.shape, 3), 0.5, np.float32)
 
 
 def true_depth(rig: Rig, surfaces: list[Surface]) -> np.ndarray:
@@ -110,7 +115,7 @@ def test_a_wall_is_found_where_it_stands(z: float) -> None:
     pair = speckle_pair(SurfaceScene([wall]), rig, 0, config=POD, rng=np.random.default_rng(1))
     truth = true_depth(rig, [wall])
     for steps, pixels in ((0, 0.4), (4, 0.1)):
-        depth = match_pair(pair, config=replace(POD, refinement_steps=steps))
+        depth = match_pair(pair, grey(pair), config=replace(POD, refinement_steps=steps))
         both = (depth > 0) & (truth > 0)
         assert both.sum() > 0.9 * (truth > 0).sum()
         one_pixel = truth[both][0] ** 2 / (pair.focal_px * pair.baseline_m)
@@ -121,7 +126,7 @@ def test_silhouettes_grow_until_they_are_cleaned_and_shadows_are_holes() -> None
     rig, surfaces = front_pod(1.4), [plate(-0.2, 0.45), plate(0.25, 0.12, x=0.03)]
     pair = speckle_pair(SurfaceScene(surfaces), rig, 0, config=POD, rng=np.random.default_rng(2))
     truth = true_depth(rig, surfaces)
-    raw, cleaned = (match_pair(pair, config=replace(POD, step_m=step)) for step in (0.0, POD.step_m))
+    raw, cleaned = (match_pair(pair, grey(pair), config=replace(POD, step_m=step)) for step in (0.0, POD.step_m))
     wrong = [(depth > 0) & (np.abs(depth - truth) > 0.05) for depth in (raw, cleaned)]
     assert wrong[0].sum() > 100
     assert wrong[1].sum() < 0.5 * wrong[0].sum()
