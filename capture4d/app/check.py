@@ -13,8 +13,20 @@ from typing import Any
 
 import numpy as np
 
-from capture4d.app.check_take import Claims, TakeFolder, open_take, posed_body, read_frame, time_stamp
+from capture4d.app.check_take import (
+    Claims,
+    TakeFolder,
+    body_state,
+    open_take,
+    posed_body,
+    read_frame,
+    time_stamp,
+    tracked_model,
+)
+from capture4d.garment_extraction import OTHER, classify_colours
+from capture4d.polygons import MeshFile
 from capture4d.preflight import BadFrame, Verdict, judge, true_rate
+from capture4d.scan_motion import Motion
 from capture4d.scan_placement import Placement, Survey, place, place_rig, sample_surface, survey_take
 from capture4d.scan_statistics import FrameStatistics, Paints, camera_counts, measure_frame, surface_shift
 from capture4d.types import Mesh, Rig, Scan
@@ -98,20 +110,39 @@ def _survey(take: TakeFolder) -> Survey | None:
     has_body = take.poses_path is not None and take.body_path is not None
     known = [number for number in take.files if not (has_body and posed) or number in set(posed or ())]
     candidates = known or list(take.files)
-    probes: list[tuple[int, Mesh]] = []
+    probes: list[tuple[int, MeshFile]] = []
     for part in np.array_split(np.array(candidates), min(PROBES, len(candidates))):
         for number in part[:20].tolist():
             found = read_frame(take.files[number], number)
             if not isinstance(found, BadFrame):
-                probes.append((number, found.mesh))
+                probes.append((number, found))
                 break
     if not probes:
         return None
-    bodies = None
-    if known and take.poses_path is not None and take.body_path is not None:
-        posed_bodies = [posed_body(take.poses_path, take.body_path, number) for number, _ in probes]
-        bodies = [body for body in posed_bodies if body is not None]
-    return survey_take([mesh for _, mesh in probes], take.facts.declared, bodies or None)
+    return survey_take([found.mesh for _, found in probes], take.facts.declared, _motion(take, probes))
+
+
+def _motion(take: TakeFolder, probes: Sequence[tuple[int, MeshFile]]) -> Motion | None:
+    """Motion capture in the probe frames, and what of them is not the garment."""
+    if take.poses_path is None or take.body_path is None:
+        return None
+    states = [body_state(take.poses_path, take.body_path, number) for number, _ in probes]
+    posed = [state for state in states if state is not None]
+    if len(posed) < len(probes):
+        return None
+    bare = [_bare(found, take.facts.paints) for _, found in probes]
+    known = all(mesh is not None for mesh in bare)
+    meshes = [mesh for mesh in bare if mesh is not None] if known else [found.mesh for _, found in probes]
+    return Motion(tracked_model(take.poses_path, take.body_path), posed, meshes, known)
+
+
+def _bare(found: MeshFile, paints: Paints) -> Mesh | None:
+    """What of a scan is neither garment nor paint; None if that cannot be told, or is next to nothing."""
+    if found.colours is None or paints.garment is None:
+        return None
+    labels = classify_colours(found.colours, paints.garment, paints.borders)
+    bare = (labels[found.mesh.faces] == OTHER).all(axis=1)
+    return Mesh(found.mesh.vertices, found.mesh.faces[bare]) if 0.1 < bare.mean() < 0.98 else None
 
 
 def _rig_of_scans(take: TakeFolder, placement: Placement) -> tuple[Rig, bool]:
