@@ -4,7 +4,7 @@ stage.json               what was run
 body.npz                 the body that was tracked: the capture's, else the built-in one
 frames/000123.npz        first pass, forwards: where the next frame starts from
 refined/000123.npz       second pass: rotations, translation, seen joints
-metrics/000123.json      verdict (good, check, lost), reasons, numbers and CPU time
+metrics/000123.json      verdict (good, check, lost), reasons, limbs that nobody scanned, numbers and CPU time
 poses.npz                the take's poses and shape, as a capture would bring them
 metrics.jsonl            the frames' metrics, one per line
 """
@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from capture4d.body_anny import load_anny
+from capture4d.body_limbs import guessed_limbs, unseen_limbs
 from capture4d.body_sequence import Followed, Quality, Refined, Tracker, between, outlying
 from capture4d.body_tracking import ScanPoints
 from capture4d.body_tracking_config import SequenceConfig, TrackingConfig
@@ -48,7 +49,7 @@ from capture4d.workdir import (
 
 __all__ = ["load_tracking", "run", "tracking_digest"]
 
-SCHEMA = 2
+SCHEMA = 3
 STARTS = ("search", "rest")
 
 
@@ -236,7 +237,8 @@ def _refine_frame(job: _RefineJob) -> None:
     start = replace(start, shape=np.array(job.shape))
     points = _points(capture, job.frame_id, job.config)
     refined = tracker.refine(points, start, around, interval_s=1 / capture.fps, lost=first.quality.lost)
-    _save_refined(stage, job.frame_id, first, refined, time.process_time() - begin)
+    unseen = unseen_limbs(tracker.model.body.joint_names, refined.seen)
+    _save_refined(stage, job.frame_id, first, refined, unseen, time.process_time() - begin)
 
 
 def _surroundings(capture: Capture, stage: Stage, frame_id: int) -> tuple[Followed, BodyState, list[BodyState]]:
@@ -267,7 +269,9 @@ def _surroundings(capture: Capture, stage: Stage, frame_id: int) -> tuple[Follow
     return own, own.state, []
 
 
-def _save_refined(stage: Stage, frame_id: int, first: Followed, refined: Refined, cpu_s: float) -> None:
+def _save_refined(
+    stage: Stage, frame_id: int, first: Followed, refined: Refined, unseen: tuple[str, ...], cpu_s: float
+) -> None:
     """Metrics first: the frame counts as done once its npz is there."""
     quality = refined.quality
     numbers = {key: value if math.isfinite(value) else None for key, value in _numbers(quality).items()}
@@ -278,6 +282,7 @@ def _save_refined(stage: Stage, frame_id: int, first: Followed, refined: Refined
             "frame_id": frame_id,
             "verdict": "lost" if quality.lost else "check" if quality.reasons else "good",
             "reasons": list(quality.reasons),
+            "unseen": list(unseen),
             **numbers,
             "started_from": first.started_from,
             "cpu_s": round(before + cpu_s, 4),
@@ -291,17 +296,24 @@ def _save_refined(stage: Stage, frame_id: int, first: Followed, refined: Refined
     )
 
 
-def _with_outliers(records: Sequence[dict[str, Any]], config: SequenceConfig) -> list[dict[str, Any]]:
+def _with_take(records: Sequence[dict[str, Any]], config: SequenceConfig) -> list[dict[str, Any]]:
     """The frames' records, flagged where only the whole take shows that something is wrong."""
     medians = np.array([np.nan if record["median_m"] is None else record["median_m"] for record in records], np.float64)
     usual, outliers = outlying(medians, config)
+    found = [record for record in records if record["verdict"] != "lost"]
+    ids = [record["frame_id"] for record in found]
+    guessed = dict(zip(ids, guessed_limbs([record["unseen"] for record in found]), strict=True))
     flagged = []
     for record, median, is_outlier in zip(records, medians, outliers, strict=True):
+        reasons = list(record["reasons"])
         if is_outlier:
-            reason = f"skin and suit lie {1e3 * median:.1f} mm from the body, {1e3 * usual:.1f} is usual in this take"
-            verdict = "lost" if record["verdict"] == "lost" else "check"
-            record = {**record, "verdict": verdict, "reasons": [*record["reasons"], reason]}
-        flagged.append(record)
+            reasons.append(
+                f"skin and suit lie {1e3 * median:.1f} mm from the body, {1e3 * usual:.1f} is usual in this take"
+            )
+        if guessed.get(record["frame_id"]):
+            reasons.append(f"not scanned, so guessed: {', '.join(guessed[record['frame_id']])}")
+        verdict = record["verdict"] if record["verdict"] == "lost" or not reasons else "check"
+        flagged.append({**record, "verdict": verdict, "reasons": reasons})
     return flagged
 
 
@@ -326,6 +338,6 @@ def _collect(capture: Capture, stage: Stage, config: TrackingConfig, shape: tupl
         ),
     )
     records = [read_json(stage.frame_path(frame_id, ".json", folder="metrics")) for frame_id in capture.frame_ids]
-    lines = [json.dumps(record) for record in _with_outliers(records, config.sequence)]
+    lines = [json.dumps(record) for record in _with_take(records, config.sequence)]
     write_bytes(stage.path / "metrics.jsonl", ("\n".join(lines) + "\n").encode())
     return stage.finish([stage.path / "body.npz", stage.path / "poses.npz", *paths])
