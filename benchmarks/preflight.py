@@ -211,12 +211,6 @@ FAULTS = (
         ("range-of-motion", "sampled", "no-borders"),
     ),
     _Fault(
-        "poses of somebody else, floor 0.3 m up",
-        "poses-mismatch",
-        lambda t: damage.other_poses(damage.move_scans(t, np.eye(3), (0, 0.3, 0)), shape=(-1.5, 0.5)),
-        ("whole-body", "side-bend"),
-    ),
-    _Fault(
         "poses of some frames",
         "poses-missing",
         lambda t: replace(t, poses=_first_poses(t, len(t.scans) - 2)),

@@ -24,7 +24,7 @@ import numpy as np
 
 from capture4d.body_anny import load_anny
 from capture4d.body_limbs import guessed_limbs, unseen_limbs
-from capture4d.body_sequence import Followed, Quality, Refined, Tracker, between, outlying
+from capture4d.body_sequence import NOTHING, Followed, Quality, Refined, Tracker, between, outlying
 from capture4d.body_tracking import ScanPoints
 from capture4d.body_tracking_config import SequenceConfig, TrackingConfig
 from capture4d.body_tracking_jacobian import BodyState
@@ -57,7 +57,7 @@ def run(capture: Path, output: Path, config: TrackingConfig, *, workers: int = 1
     """Track the body through every frame; the digest of the result.
 
     Raises:
-        InputError: the capture is damaged, or the start is no pose of its body.
+        InputError: the capture is damaged, none of its scans can be read, or the start is no pose of its body.
     """
     description = read_capture(capture)
     upstream = {"capture": capture_digest(description)}
@@ -134,15 +134,21 @@ def _follow_frames(job: _FollowJob) -> int:
         path = stage.frame_path(frame_id)
         if frame_id in pending:
             begin = time.process_time()
-            points = _points(capture, frame_id, job.config)
-            if last is None:
-                followed = tracker.begin(points, _start(tracker, job.config, frame_id))
-            else:
+            points, fault = _points(capture, frame_id, job.config)
+            if last is not None:
                 followed = tracker.follow(points, last, before)
+            elif fault:
+                followed = tracker.nothing(points)
+            else:
+                followed = tracker.begin(points, _start(tracker, job.config, frame_id))
             _save_followed(path, followed, time.process_time() - begin)
         followed = _load_followed(path)
+        if followed.started_from == NOTHING:
+            continue
         before = last if followed.lost_frames == 0 and last is not None and last.lost_frames == 0 else None
         last = followed
+    if last is None:
+        raise InputError(_points(capture, capture.frame_ids[0], job.config)[1])
     return len(pending)
 
 
@@ -152,17 +158,16 @@ def _tracker(folder: Path, config: TrackingConfig) -> Tracker:
     return Tracker.create(load_body(folder / "body.npz"), config)
 
 
-def _points(capture: Capture, frame_id: int, config: TrackingConfig) -> ScanPoints:
-    """Points of a scan; none where it cannot be read, which loses the frame."""
+def _points(capture: Capture, frame_id: int, config: TrackingConfig) -> tuple[ScanPoints, str]:
+    """Points of a scan, and what is wrong with it: none where it cannot be read, which loses the frame."""
+    colours = take_colours(capture)
     try:
-        colours = take_colours(capture)
         scan = colours.flat(read_scan(capture, frame_id))
         paints = tuple(dict.fromkeys(colours.boundary.values()))
-        return scan_points(scan, colours.garment, paints, config.sampling, source=str(scan_path(capture, frame_id)))
-    except InputError:
-        if frame_id == capture.frame_ids[0]:
-            raise
-        return ScanPoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, bool))
+        source = str(scan_path(capture, frame_id))
+        return scan_points(scan, colours.garment, paints, config.sampling, source=source), ""
+    except InputError as error:
+        return ScanPoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, bool)), str(error)
 
 
 def _start(tracker: Tracker, config: TrackingConfig, frame_id: int) -> BodyState | None:
@@ -235,8 +240,10 @@ def _refine_frame(job: _RefineJob) -> None:
     tracker = _tracker(stage.path, job.config)
     first, start, around = _surroundings(capture, stage, job.frame_id)
     start = replace(start, shape=np.array(job.shape))
-    points = _points(capture, job.frame_id, job.config)
+    points, fault = _points(capture, job.frame_id, job.config)
     refined = tracker.refine(points, start, around, interval_s=1 / capture.fps, lost=first.quality.lost)
+    if fault:
+        refined = replace(refined, quality=replace(refined.quality, reasons=(fault,)))
     unseen = unseen_limbs(tracker.model.body.joint_names, refined.seen)
     _save_refined(stage, job.frame_id, first, refined, unseen, time.process_time() - begin)
 

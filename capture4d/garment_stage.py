@@ -62,9 +62,8 @@ def run(capture: Path, output: Path, *, learn_colours: bool = False, workers: in
     if pending or not colours_path.is_file():
         colours = take_colours(description, learn=learn_colours)
         write_json(colours_path, _described(colours))
-        _extract_first(description, colours, stage, pending)
-        pending = [*stage.pending(description.frame_ids), *_damaged(stage, description.frame_ids)]
-        jobs = [(frame_id, stage.frame_path(frame_id)) for frame_id in sorted(pending)]
+        done = _extract_first(description, colours, stage, pending)
+        jobs = [(frame_id, stage.frame_path(frame_id)) for frame_id in sorted(pending) if frame_id != done]
         for _ in run_jobs(partial(write_frame, description, colours), jobs, workers=workers, label="extract garment"):
             pass
     return stage.finish([colours_path, *(stage.frame_path(frame_id) for frame_id in description.frame_ids)])
@@ -89,9 +88,11 @@ def _reason(path: Path) -> tuple[str, bool]:
         return ("", False) if reason is None else (str(reason), bool(arrays["damaged"]))
 
 
-def _extract_first(capture: Capture, colours: KnownColours, stage: Stage, pending: Sequence[int]) -> None:
+def _extract_first(capture: Capture, colours: KnownColours, stage: Stage, pending: Sequence[int]) -> int | None:
     """Extract the first frame that can be read, if that is not done, to see that the colours are right.
 
+    Returns:
+        The frame; None if it was done before.
     Raises:
         ColourNotFoundError: the garment or a paint is not in it.
         InputError: no frame can be read; about the first.
@@ -99,7 +100,7 @@ def _extract_first(capture: Capture, colours: KnownColours, stage: Stage, pendin
     faults = []
     for frame_id in capture.frame_ids:
         if frame_id not in pending:
-            return
+            return None
         try:
             found = extract_frame(capture, colours, frame_id)
         except ColourNotFoundError:
@@ -108,7 +109,7 @@ def _extract_first(capture: Capture, colours: KnownColours, stage: Stage, pendin
             faults.append(error)
             continue
         save_garment_scan(stage.frame_path(frame_id), found)
-        return
+        return frame_id
     raise faults[0]
 
 

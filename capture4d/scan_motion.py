@@ -65,7 +65,8 @@ def fit_posed_bodies(
         probes: points on scans, metres, in file axes.
         bodies: posed body surface of each.
     Returns:
-        The misfit, metres, and the permutation, for all 48; the best first. A common shift of the take is let pass.
+        The misfit, metres, and the permutation, for all 48; the best first. A common shift of the take is let pass,
+        be it of whole people or of their upper halves.
     """
     trees = [KDTree(np.asarray(body, np.float64)) for body in bodies]
     fits = []
@@ -78,7 +79,9 @@ def fit_posed_bodies(
 
 
 def _misfit(probes: list[np.ndarray], bodies: Sequence[np.ndarray], trees: list[KDTree]) -> float:
-    starts = (np.zeros(3), np.mean([b.mean(axis=0) - p.mean(axis=0) for p, b in zip(probes, bodies, strict=True)], 0))
+    middles = np.mean([b.mean(axis=0) - p.mean(axis=0) for p, b in zip(probes, bodies, strict=True)], 0)
+    tops = np.mean([b[:, 1].max() - p[:, 1].max() for p, b in zip(probes, bodies, strict=True)])
+    starts = (np.zeros(3), middles, np.array([middles[0], tops, middles[2]]))
     best = np.inf
     for shift in starts:
         for step in range(4):

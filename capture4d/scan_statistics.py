@@ -253,11 +253,10 @@ def camera_counts(rig: Rig, points: Float[np.ndarray, "points 3"]) -> np.ndarray
 def rig_middle(rig: Rig) -> Float64[np.ndarray, " 3"]:
     """The point nearest to all optical axes, in the least squares sense; where it is not determined, that nearest to
     the cameras' mean."""
-    centres = -np.einsum("cba,cb->ca", rig.T_camera_world[:, :3, :3], rig.T_camera_world[:, :3, 3])
     axes = rig.T_camera_world[:, 2, :3]
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    start = centres.mean(axis=0)
-    away = np.einsum("cab,cb->a", across, centres - start)
+    start = rig.centres.mean(axis=0)
+    away = np.einsum("cab,cb->a", across, rig.centres - start)
     return start + np.linalg.pinv(across.sum(axis=0), rcond=1e-6) @ away
 
 

@@ -41,6 +41,10 @@ SUSPECTS = 60
 """Files of odd sizes that a sample holds beyond that."""
 RUN = 16
 """Frames of a job."""
+LEARNED = (
+    "No garment_colour is given: extract and track will learn the colours from the scans. What is said here of garment "
+    "and borders takes one; --garment-colour and --border-colour give them."
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -259,6 +263,7 @@ def as_json(checked: Checked, *, fixed: Path | None = None) -> dict[str, Any]:
         "status": ("clean", "warnings", "errors")[exit_code(checked.verdict)],
         "frames": len(checked.take.files),
         "frames_checked": checked.frames,
+        "colours": "learned" if _learns(checked) else "given",
         "findings": [
             {
                 "code": finding.code,
@@ -275,20 +280,27 @@ def as_json(checked: Checked, *, fixed: Path | None = None) -> dict[str, Any]:
     }
 
 
+def _learns(checked: Checked) -> bool:
+    """The take does not say which colour its garment has."""
+    return checked.take.facts.paints.garment is None
+
+
 def print_table(checked: Checked) -> None:
     from rich.console import Console
     from rich.table import Table
 
     console = Console()
     looked = f"{checked.frames} of {len(checked.take.files)} frames"
-    if not checked.verdict.findings:
+    if checked.verdict.findings:
+        table = Table("", "finding", "what was found", "what to do", title=f"{checked.take.path} ({looked} looked at)")
+        for finding in checked.verdict.findings:
+            frames = f"\nframes {_ranges(finding.frames)}" if finding.frames else ""
+            table.add_row(finding.severity, finding.code, finding.found + frames, finding.advice)
+        console.print(table)
+    else:
         console.print(f"{checked.take.path}: clean ({looked} looked at)", highlight=False, soft_wrap=True)
-        return
-    table = Table("", "finding", "what was found", "what to do", title=f"{checked.take.path} ({looked} looked at)")
-    for finding in checked.verdict.findings:
-        frames = f"\nframes {_ranges(finding.frames)}" if finding.frames else ""
-        table.add_row(finding.severity, finding.code, finding.found + frames, finding.advice)
-    console.print(table)
+    if _learns(checked):
+        console.print(LEARNED, highlight=False, soft_wrap=True)
 
 
 def _ranges(numbers: Sequence[int], most: int = 6) -> str:

@@ -83,14 +83,24 @@ def test_a_take_is_tracked_and_a_run_that_was_cut_short_ends_the_same(tmp_path: 
 
 
 @pytest.mark.slow
-def test_a_frame_says_which_limbs_nobody_scanned(tmp_path: Path) -> None:
+def test_a_frame_says_which_limbs_nobody_scanned_and_what_is_wrong_with_its_scan(tmp_path: Path) -> None:
     arm = ("lowerarm01.R", "lowerarm02.R", "wrist.R")
-    save_poses(tmp_path / "start.npz", dressed_capture(tmp_path / "capture", 3, without={1: arm}))
+    truth = dressed_capture(tmp_path / "capture", 5, without={2: arm})
+    save_poses(tmp_path / "start.npz", truth)
+    for frame in ("000005", "000009"):
+        path = tmp_path / "capture" / "scans" / f"{frame}.ply"
+        path.write_bytes(path.read_bytes()[:5000])
     run(tmp_path / "capture", tmp_path / "body", TrackingConfig(start=str(tmp_path / "start.npz")))
     records = [json.loads(line) for line in (tmp_path / "body" / "metrics.jsonl").read_text().splitlines()]
-    assert [record["verdict"] for record in records] == ["good", "check", "good"]
-    assert [record["unseen"] for record in records] == [[], ["right forearm", "right hand"], []]
-    assert records[1]["reasons"] == ["not scanned, so guessed: right forearm, right hand"]
+    assert [record["verdict"] for record in records] == ["lost", "good", "check", "good", "lost"]
+    assert [record["unseen"] for record in records[1:4]] == [[], ["right forearm", "right hand"], []]
+    assert records[2]["reasons"] == ["not scanned, so guessed: right forearm, right hand"]
+    for record, name in ((records[0], "000005.ply"), (records[4], "000009.ply")):
+        assert f"{name}: cut off" in record["reasons"][0]
+    body, found = load_tracking(tmp_path / "body")
+    here, there = with_shape(body, found.shape), with_shape(body, truth.shape)
+    apart = pose_frame(here, found, 0).vertices() - pose_frame(there, truth, 0).vertices()
+    assert np.linalg.norm(apart, axis=1).mean() < 0.02, "a lost first frame has the pose of the next one"
 
 
 def test_a_start_that_is_no_file_and_a_stage_that_was_not_run(tmp_path: Path) -> None:
