@@ -42,8 +42,8 @@ SUSPECTS = 60
 RUN = 16
 """Frames of a job."""
 LEARNED = (
-    "No garment_colour is given: extract and track will learn the colours from the scans. What is said here of garment "
-    "and borders takes one; --garment-colour and --border-colour give them."
+    "No garment_colour is given: extract and track will learn the colours from the scans. "
+    "Garment and borders are not looked at here without --garment-colour and --border-colour."
 )
 
 
