@@ -79,7 +79,6 @@ WALKS_OUT = PlainTakeConfig(seed=8, walk_m=(1.1, 0.1), rig_follows_walk=False, s
 QUICK = ("reach", "range-of-motion", "whole-body")
 
 FOLLOWS: dict[Code, set[Code]] = {
-    "poses-mismatch": {"floor"},
     "frame-empty": {"frames-missing"},
 }
 """What may be reported beside a fault because it follows from it."""
@@ -192,6 +191,12 @@ FAULTS = (
         "outside-volume",
         lambda t: damage.other_poses(damage.move_scans(t, np.eye(3), (2.5, 0, 0)), shift=(2.5, 0, 0)),
     ),
+    _Fault(
+        "a metre beside the rig, no poses",
+        "outside-volume",
+        lambda t: replace(damage.move_scans(t, np.eye(3), (-0.6, 0, 0.8)), poses=None, body=None),
+        ("range-of-motion", "side-bend"),
+    ),
     _Fault("noise of 0.4 spacings", "noise", lambda t: damage.noisy(t, 0.4)),
     _Fault("riddled with holes", "holes", lambda t: damage.punctured(t, 220, 0.025), ("reach", "whole-body")),
     _Fault(
@@ -199,6 +204,12 @@ FAULTS = (
     ),
     _Fault("poses 0.1 m beside", "poses-mismatch", lambda t: damage.other_poses(t, shift=(0.07, 0, 0.07))),
     _Fault("poses of somebody else", "poses-mismatch", lambda t: damage.other_poses(t, shape=(-2.0, 2.0))),
+    _Fault(
+        "poses of somebody taller",
+        "poses-mismatch",
+        lambda t: damage.other_poses(t, shape=(1.5, -1.0, 1.0)),
+        ("range-of-motion", "sampled", "no-borders"),
+    ),
     _Fault(
         "poses of some frames",
         "poses-missing",

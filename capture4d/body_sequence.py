@@ -25,8 +25,10 @@ from capture4d.body_tracking_config import Schedule, SequenceConfig, TrackingCon
 from capture4d.body_tracking_jacobian import BodyState, TrackedBody, match, pose_surface, tracked_body
 from capture4d.types import Body
 
-__all__ = ["Followed", "Quality", "Refined", "Tracker", "between", "judge", "outlying"]
+__all__ = ["NOTHING", "Followed", "Quality", "Refined", "Tracker", "between", "judge", "outlying"]
 
+NOTHING = "nothing"
+"""Where frames before the first that can be read start from."""
 SEEN_POINTS = 8
 """A joint is seen if so many explained points lie on what it moves itself."""
 
@@ -92,6 +94,12 @@ class Tracker:
         quality = self._judge(scan, fit)
         information = self._shape_information(fit)
         return Followed(fit.state, information, quality, name, int(quality.lost), int(bool(quality.reasons)))
+
+    def nothing(self, scan: ScanPoints) -> Followed:
+        """A frame without points before the first that has some."""
+        state, quality = self.model.rest_state(), judge(np.zeros(len(scan.cloth)), scan.cloth, self.config.sequence)
+        shapes = len(state.shape)
+        return Followed(state, np.zeros((shapes, shapes)), quality, NOTHING, 1, 1)
 
     def follow(self, scan: ScanPoints, last: Followed, before: Followed | None) -> Followed:
         """The frame after `last`; `before` is the one before that."""

@@ -4,7 +4,7 @@ stage.json               what was run
 body.npz                 the body that was tracked: the capture's, else the built-in one
 frames/000123.npz        first pass, forwards: where the next frame starts from
 refined/000123.npz       second pass: rotations, translation, seen joints
-metrics/000123.json      verdict (good, check, lost), reasons, numbers and CPU time
+metrics/000123.json      verdict (good, check, lost), reasons, limbs that nobody scanned, numbers and CPU time
 poses.npz                the take's poses and shape, as a capture would bring them
 metrics.jsonl            the frames' metrics, one per line
 """
@@ -23,7 +23,8 @@ from typing import Any
 import numpy as np
 
 from capture4d.body_anny import load_anny
-from capture4d.body_sequence import Followed, Quality, Refined, Tracker, between, outlying
+from capture4d.body_limbs import guessed_limbs, unseen_limbs
+from capture4d.body_sequence import NOTHING, Followed, Quality, Refined, Tracker, between, outlying
 from capture4d.body_tracking import ScanPoints
 from capture4d.body_tracking_config import SequenceConfig, TrackingConfig
 from capture4d.body_tracking_jacobian import BodyState
@@ -48,7 +49,7 @@ from capture4d.workdir import (
 
 __all__ = ["load_tracking", "run", "tracking_digest"]
 
-SCHEMA = 2
+SCHEMA = 3
 STARTS = ("search", "rest")
 
 
@@ -56,7 +57,7 @@ def run(capture: Path, output: Path, config: TrackingConfig, *, workers: int = 1
     """Track the body through every frame; the digest of the result.
 
     Raises:
-        InputError: the capture is damaged, or the start is no pose of its body.
+        InputError: the capture is damaged, none of its scans can be read, or the start is no pose of its body.
     """
     description = read_capture(capture)
     upstream = {"capture": capture_digest(description)}
@@ -133,15 +134,21 @@ def _follow_frames(job: _FollowJob) -> int:
         path = stage.frame_path(frame_id)
         if frame_id in pending:
             begin = time.process_time()
-            points = _points(capture, frame_id, job.config)
-            if last is None:
-                followed = tracker.begin(points, _start(tracker, job.config, frame_id))
-            else:
+            points, fault = _points(capture, frame_id, job.config)
+            if last is not None:
                 followed = tracker.follow(points, last, before)
+            elif fault:
+                followed = tracker.nothing(points)
+            else:
+                followed = tracker.begin(points, _start(tracker, job.config, frame_id))
             _save_followed(path, followed, time.process_time() - begin)
         followed = _load_followed(path)
+        if followed.started_from == NOTHING:
+            continue
         before = last if followed.lost_frames == 0 and last is not None and last.lost_frames == 0 else None
         last = followed
+    if last is None:
+        raise InputError(_points(capture, capture.frame_ids[0], job.config)[1])
     return len(pending)
 
 
@@ -151,17 +158,16 @@ def _tracker(folder: Path, config: TrackingConfig) -> Tracker:
     return Tracker.create(load_body(folder / "body.npz"), config)
 
 
-def _points(capture: Capture, frame_id: int, config: TrackingConfig) -> ScanPoints:
-    """Points of a scan; none where it cannot be read, which loses the frame."""
+def _points(capture: Capture, frame_id: int, config: TrackingConfig) -> tuple[ScanPoints, str]:
+    """Points of a scan, and what is wrong with it: none where it cannot be read, which loses the frame."""
+    colours = take_colours(capture)
     try:
-        colours = take_colours(capture)
         scan = colours.flat(read_scan(capture, frame_id))
         paints = tuple(dict.fromkeys(colours.boundary.values()))
-        return scan_points(scan, colours.garment, paints, config.sampling, source=str(scan_path(capture, frame_id)))
-    except InputError:
-        if frame_id == capture.frame_ids[0]:
-            raise
-        return ScanPoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, bool))
+        source = str(scan_path(capture, frame_id))
+        return scan_points(scan, colours.garment, paints, config.sampling, source=source), ""
+    except InputError as error:
+        return ScanPoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, bool)), str(error)
 
 
 def _start(tracker: Tracker, config: TrackingConfig, frame_id: int) -> BodyState | None:
@@ -234,9 +240,12 @@ def _refine_frame(job: _RefineJob) -> None:
     tracker = _tracker(stage.path, job.config)
     first, start, around = _surroundings(capture, stage, job.frame_id)
     start = replace(start, shape=np.array(job.shape))
-    points = _points(capture, job.frame_id, job.config)
+    points, fault = _points(capture, job.frame_id, job.config)
     refined = tracker.refine(points, start, around, interval_s=1 / capture.fps, lost=first.quality.lost)
-    _save_refined(stage, job.frame_id, first, refined, time.process_time() - begin)
+    if fault:
+        refined = replace(refined, quality=replace(refined.quality, reasons=(fault,)))
+    unseen = unseen_limbs(tracker.model.body.joint_names, refined.seen)
+    _save_refined(stage, job.frame_id, first, refined, unseen, time.process_time() - begin)
 
 
 def _surroundings(capture: Capture, stage: Stage, frame_id: int) -> tuple[Followed, BodyState, list[BodyState]]:
@@ -267,7 +276,9 @@ def _surroundings(capture: Capture, stage: Stage, frame_id: int) -> tuple[Follow
     return own, own.state, []
 
 
-def _save_refined(stage: Stage, frame_id: int, first: Followed, refined: Refined, cpu_s: float) -> None:
+def _save_refined(
+    stage: Stage, frame_id: int, first: Followed, refined: Refined, unseen: tuple[str, ...], cpu_s: float
+) -> None:
     """Metrics first: the frame counts as done once its npz is there."""
     quality = refined.quality
     numbers = {key: value if math.isfinite(value) else None for key, value in _numbers(quality).items()}
@@ -278,6 +289,7 @@ def _save_refined(stage: Stage, frame_id: int, first: Followed, refined: Refined
             "frame_id": frame_id,
             "verdict": "lost" if quality.lost else "check" if quality.reasons else "good",
             "reasons": list(quality.reasons),
+            "unseen": list(unseen),
             **numbers,
             "started_from": first.started_from,
             "cpu_s": round(before + cpu_s, 4),
@@ -291,17 +303,24 @@ def _save_refined(stage: Stage, frame_id: int, first: Followed, refined: Refined
     )
 
 
-def _with_outliers(records: Sequence[dict[str, Any]], config: SequenceConfig) -> list[dict[str, Any]]:
+def _with_take(records: Sequence[dict[str, Any]], config: SequenceConfig) -> list[dict[str, Any]]:
     """The frames' records, flagged where only the whole take shows that something is wrong."""
     medians = np.array([np.nan if record["median_m"] is None else record["median_m"] for record in records], np.float64)
     usual, outliers = outlying(medians, config)
+    found = [record for record in records if record["verdict"] != "lost"]
+    ids = [record["frame_id"] for record in found]
+    guessed = dict(zip(ids, guessed_limbs([record["unseen"] for record in found]), strict=True))
     flagged = []
     for record, median, is_outlier in zip(records, medians, outliers, strict=True):
+        reasons = list(record["reasons"])
         if is_outlier:
-            reason = f"skin and suit lie {1e3 * median:.1f} mm from the body, {1e3 * usual:.1f} is usual in this take"
-            verdict = "lost" if record["verdict"] == "lost" else "check"
-            record = {**record, "verdict": verdict, "reasons": [*record["reasons"], reason]}
-        flagged.append(record)
+            reasons.append(
+                f"skin and suit lie {1e3 * median:.1f} mm from the body, {1e3 * usual:.1f} is usual in this take"
+            )
+        if guessed.get(record["frame_id"]):
+            reasons.append(f"not scanned, so guessed: {', '.join(guessed[record['frame_id']])}")
+        verdict = record["verdict"] if record["verdict"] == "lost" or not reasons else "check"
+        flagged.append({**record, "verdict": verdict, "reasons": reasons})
     return flagged
 
 
@@ -326,6 +345,6 @@ def _collect(capture: Capture, stage: Stage, config: TrackingConfig, shape: tupl
         ),
     )
     records = [read_json(stage.frame_path(frame_id, ".json", folder="metrics")) for frame_id in capture.frame_ids]
-    lines = [json.dumps(record) for record in _with_outliers(records, config.sequence)]
+    lines = [json.dumps(record) for record in _with_take(records, config.sequence)]
     write_bytes(stage.path / "metrics.jsonl", ("\n".join(lines) + "\n").encode())
     return stage.finish([stage.path / "body.npz", stage.path / "poses.npz", *paths])

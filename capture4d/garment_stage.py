@@ -1,13 +1,15 @@
 """The stage that cuts the garment out of every scan: CAPTURE in, WORK/garment out.
 
 Colours that capture.json does not give are learned from a few scans first, and written to colours.json. All must be in
-the first frame, or else capture.json is wrong. In a later frame that lacks them, because the
-subject has left the volume or hides a border, the reason is written instead of a garment, and registration flags it.
+the first frame that can be read, or else capture.json is wrong. A later frame that lacks them, because the subject has
+left the volume or hides a border, and any frame whose scan is damaged, gets the reason instead of a garment, and
+registration flags it. Damaged scans are read again in every run, in case they were repaired.
 """
 
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,14 +19,15 @@ import numpy as np
 
 from capture4d.errors import InputError
 from capture4d.garment_extraction import ColourNotFoundError
+from capture4d.records import ArrayFile
 from capture4d.scans import Capture, capture_digest, format_colour, read_capture, read_scan, scan_path
 from capture4d.take_colours import KnownColours, cut_out, take_colours
 from capture4d.types import GarmentScan, Mesh
-from capture4d.workdir import open_stage, run_jobs, write_json, write_npz
+from capture4d.workdir import Stage, open_stage, run_jobs, write_json, write_npz
 
-__all__ = ["load_garment_scan", "run", "save_garment_scan"]
+__all__ = ["flagged_frames", "load_garment_scan", "run", "save_garment_scan"]
 
-SCHEMA = 1
+SCHEMA = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,8 +44,8 @@ def run(capture: Path, output: Path, *, learn_colours: bool = False, workers: in
     Args:
         learn_colours: learn all colours from the scans, not only those that capture.json leaves open.
     Raises:
-        InputError: a scan is missing, damaged, without colours, or without the garment's colours; or these are to be
-            learned and are not separable.
+        InputError: a scan is missing, none can be read, or the first that can lacks the garment's colours; or these are
+            to be learned and are not separable.
     """
     description = read_capture(capture)
     stage = open_stage(
@@ -55,17 +58,59 @@ def run(capture: Path, output: Path, *, learn_colours: bool = False, workers: in
         overwrite=overwrite,
     )
     colours_path = stage.path / "colours.json"
-    pending = stage.pending(description.frame_ids)
+    pending = [*stage.pending(description.frame_ids), *_damaged(stage, description.frame_ids)]
     if pending or not colours_path.is_file():
         colours = take_colours(description, learn=learn_colours)
         write_json(colours_path, _described(colours))
-        first = description.frame_ids[0]
-        if first in pending:
-            save_garment_scan(stage.frame_path(first), extract_frame(description, colours, first))
-        jobs = [(frame_id, stage.frame_path(frame_id)) for frame_id in stage.pending(description.frame_ids)]
+        done = _extract_first(description, colours, stage, pending)
+        jobs = [(frame_id, stage.frame_path(frame_id)) for frame_id in sorted(pending) if frame_id != done]
         for _ in run_jobs(partial(write_frame, description, colours), jobs, workers=workers, label="extract garment"):
             pass
     return stage.finish([colours_path, *(stage.frame_path(frame_id) for frame_id in description.frame_ids)])
+
+
+def flagged_frames(folder: Path) -> dict[int, str]:
+    """Frames of an extraction without a garment, and why, in ascending order."""
+    reasons = {int(path.stem): _reason(path)[0] for path in sorted((folder / "frames").glob("*.npz"))}
+    return {frame_id: reason for frame_id, reason in reasons.items() if reason}
+
+
+def _damaged(stage: Stage, frame_ids: Sequence[int]) -> list[int]:
+    """Frames whose scan an earlier run could not read."""
+    done = sorted(set(frame_ids) - set(stage.pending(frame_ids)))
+    return [frame_id for frame_id in done if _reason(stage.frame_path(frame_id))[1]]
+
+
+def _reason(path: Path) -> tuple[str, bool]:
+    """Why a frame has no garment, nothing if it has one; and whether that is because its scan is damaged."""
+    with ArrayFile(path) as arrays:
+        reason = arrays.get("reason")
+        return ("", False) if reason is None else (str(reason), bool(arrays["damaged"]))
+
+
+def _extract_first(capture: Capture, colours: KnownColours, stage: Stage, pending: Sequence[int]) -> int | None:
+    """Extract the first frame that can be read, if that is not done, to see that the colours are right.
+
+    Returns:
+        The frame; None if it was done before.
+    Raises:
+        ColourNotFoundError: the garment or a paint is not in it.
+        InputError: no frame can be read; about the first.
+    """
+    faults = []
+    for frame_id in capture.frame_ids:
+        if frame_id not in pending:
+            return None
+        try:
+            found = extract_frame(capture, colours, frame_id)
+        except ColourNotFoundError:
+            raise
+        except InputError as error:
+            faults.append(error)
+            continue
+        save_garment_scan(stage.frame_path(frame_id), found)
+        return frame_id
+    raise faults[0]
 
 
 def _described(colours: KnownColours) -> dict[str, Any]:
@@ -87,8 +132,9 @@ def write_frame(capture: Capture, colours: KnownColours, job: tuple[int, Path]) 
     frame_id, path = job
     try:
         save_garment_scan(path, extract_frame(capture, colours, frame_id))
-    except ColourNotFoundError as error:
-        write_npz(path, reason=np.array(str(error)))
+    except InputError as error:
+        damaged = not isinstance(error, ColourNotFoundError)
+        write_npz(path, reason=np.array(str(error)), damaged=np.array(damaged))
 
 
 def save_garment_scan(path: Path, scan: GarmentScan) -> None:

@@ -28,6 +28,8 @@ __all__ = ["TemplateReport", "UvChoice", "make_template", "name_loops", "weld"]
 UvChoice = Literal["auto", "keep", "fresh", "none"]
 FAR_M = 0.25
 """A garment whose vertices lie farther than this from the body, in the median, is not on it."""
+LEAST_SIZE_M = 0.05
+"""A smaller mesh is no garment in these units, though it may lie near a foot."""
 NORMAL_WEIGHT = 4.0
 """How much more facing counts than in tracking: loose cloth hangs centimetres away from its limb."""
 ARM = r"upperarm|lowerarm|wrist|elbow|_shoulder|_hand"
@@ -62,6 +64,9 @@ def make_template(
         InputError: the mesh cannot be a template; says what was expected.
     """
     _require_surface(mesh, source)
+    size = float(np.ptp(mesh.vertices, axis=0).max())
+    if size < LEAST_SIZE_M:
+        raise InputError(f"{source}: expected a garment, found a mesh of {1e3 * size:.2g} mm; its units differ")
     at, barycentric, weights, nearest = _bind(mesh, body)
     distance = float(np.median(np.linalg.norm(mesh.vertices - nearest, axis=1)))
     if distance > FAR_M:

@@ -116,8 +116,8 @@ class Limits:
     """Largest share of a paint that lies away from the cloth."""
     cameras_lost: float = 0.12
     """Share of the views that a frame may lose against the take's best frames."""
-    cameras_least: float = 0.15
-    """Least share of the cameras that look at the subject."""
+    cameras_least: float = 0.5
+    """Least share of the views that a frame has against the middle of the rig."""
     left_m: float = 0.25
     """Walked this far while the surface shrinks: left the volume, where no rig tells."""
     pose_distance_m: float = 0.02
@@ -383,7 +383,8 @@ def _outside(frames: Sequence[FrameStatistics], size: np.ndarray, limits: Limits
     if all(frame.camera_share is not None for frame in frames):
         share = np.array([frame.camera_share for frame in frames], float)
         lost = 1 - share / max(np.percentile(share, 90), 1e-9)
-        return np.maximum(lost / limits.cameras_lost, limits.cameras_least / np.maximum(share, 1e-3))
+        beside = share / np.maximum([frame.best_share or 0.0 for frame in frames], 1e-3)
+        return np.maximum(lost / limits.cameras_lost, limits.cameras_least / np.maximum(beside, 1e-3))
     centre = np.array([frame.centre for frame in frames])[:, [0, 2]]
     whole = size >= 0.95
     away = np.linalg.norm(centre - np.median(centre[whole], axis=0), axis=1) if whole.any() else np.zeros(len(size))
@@ -457,6 +458,9 @@ def _check_colours(facts: TakeFacts, frames: Sequence[FrameStatistics], limits: 
 def _check_poses(
     facts: TakeFacts, survey: Survey | None, frames: Sequence[FrameStatistics], limits: Limits
 ) -> Iterator[Finding]:
+    if survey is not None and survey.person_ratio is not None:
+        text = f"the body in the scans differs from that of the motion capture by {1e3 * survey.person_m:.0f} mm"
+        yield Finding("poses-mismatch", text, _capped(survey.person_ratio))
     measured = [frame for frame in frames if frame.pose_distance_m is not None]
     if not measured:
         return

@@ -123,9 +123,13 @@ def save_rig(path: str | Path, rig: Rig) -> None:
 
 
 def load_rig(path: str | Path) -> Rig:
-    cameras = read_json(path)
+    found = read_json(path)
+    if not isinstance(found, dict):
+        raise InputError(f"{path}: expected a JSON object with cameras, found {type(found).__name__}")
     try:
-        cameras = cameras["cameras"]
+        cameras = found["cameras"]
+        if not cameras:
+            raise InputError("expected at least one camera, found none")
         return Rig(
             names=tuple(str(camera["name"]) for camera in cameras),
             intrinsics=np.array([camera["intrinsics"] for camera in cameras], np.float64),
@@ -134,7 +138,8 @@ def load_rig(path: str | Path) -> Rig:
             image_sizes=np.array([[camera["width"], camera["height"]] for camera in cameras], np.int32),
         )
     except KeyError as error:
-        raise InputError(f"{path}: expected the entry {error} for every camera, found none") from None
+        where = "" if str(error) == "'cameras'" else " for every camera"
+        raise InputError(f"{path}: expected the entry {error}{where}, found none") from None
     except (TypeError, ValueError) as error:
         raise InputError(f"{path}: {error}") from None
 

@@ -2,8 +2,8 @@
 
 Told from a few frames of a standing person in clothes. Size comes from the surface. Without motion capture, up is the
 direction in which a rough mannequin (head on top, trunk, legs; arms wherever they may be) fits best. With it, all 48
-ways to swap and turn over the axes are tried against the posed bodies; that also finds a mirrored take, which nothing
-else can tell from one whose faces wind the wrong way round.
+ways to swap and turn over the axes are tried against the posed bodies (`capture4d.scan_motion`); that also finds a
+mirrored take, which nothing else can tell from one whose faces wind the wrong way round.
 
 Letters: N points, P probe frames. A placement maps file coordinates to metres, Y up: `scale * axes @ x`.
 """
@@ -20,6 +20,7 @@ from jaxtyping import Float, Float64
 from scipy.spatial import KDTree
 
 from capture4d.mesh import face_areas
+from capture4d.scan_motion import CLIP_M, Motion, fit_person, fit_posed_bodies, floor_by_poses
 from capture4d.scan_statistics import outwardness
 from capture4d.types import Mesh, Rig
 
@@ -31,7 +32,6 @@ __all__ = [
     "find_units",
     "find_up",
     "fit_mannequin",
-    "fit_posed_bodies",
     "place",
     "place_rig",
     "sample_surface",
@@ -49,6 +49,11 @@ FAULT = 1.12
 """A fault is believed if it explains the frames better by this factor."""
 TRUSTED_POSES_M = 0.035
 """Motion capture that fits no better than this, whatever the axes, is not of this take."""
+MAX_PERSON_M = 0.015
+"""Root mean square distance between the body of the motion capture and the one that the scans show. Coefficients of two
+standard deviations make 25 to 60 mm, one that was fitted to the scans has less than 1."""
+MAX_PERSON_DRESSED_M = 0.025
+"""The same where cloth cannot be told from the body, and adds 8 mm."""
 MAX_FLOOR_M = 0.05
 FEET_SEEN_M = 0.3
 """A scan that ends less than this above the mannequin's soles shows the feet."""
@@ -57,10 +62,11 @@ MANNEQUIN_SINKS_M = 0.13
 SOLE_LOST_M = 0.03
 """Soles are not scanned; a scan ends at the edge of the foot."""
 PROBE_POINTS = 200
-CLIP_M = 0.12
-"""A point farther from the mannequin is simply not explained by it."""
+BARE_POINTS = 400
+"""Of skin and suit, for telling who it is."""
 NORMAL_M = 0.06
 """A unit of difference between normals counts as much as this distance."""
+UNIT_NORMALS = np.array([1.0] * 3 + [NORMAL_M] * 3)
 SCALE_RANGE = (0.8, 1.2)
 """Sizes of adults relative to the mannequin's 1.72 m."""
 
@@ -133,17 +139,19 @@ class Survey:
     floor_exact: bool
     """The feet were seen, or motion capture tells; else the floor is known to a hand's breadth or two."""
     by_poses: bool
+    person_ratio: float | None = None
+    """How far the body that the scans show is from that of the motion capture, over what is tolerated; None without."""
+    person_m: float = 0.0
+    """That distance: root mean square over what was scanned."""
 
 
-def survey_take(
-    probes: Sequence[Mesh], declared: float, bodies: Sequence[Float[np.ndarray, "verts 3"]] | None = None
-) -> Survey:
+def survey_take(probes: Sequence[Mesh], declared: float, motion: Motion | None = None) -> Survey:
     """Find units, axes, handedness, winding and floor.
 
     Args:
         probes: scans of a few frames as their files have them.
         declared: metres in a unit of the files, as the capture says.
-        bodies: posed body surface of each, metres.
+        motion: motion capture in these frames.
     """
     size = float(np.median([np.sqrt(_area(mesh)) for mesh in probes]))
     ratio = size * declared / SUBJECT_SIZE_M
@@ -155,10 +163,10 @@ def survey_take(
         if left > MAX_SIZE_RATIO:
             units, scale = None, SUBJECT_SIZE_M / max(size, 1e-12)
     sign = float(np.median([outwardness(mesh) for mesh in probes]))
-    points = [sample_surface(mesh, outward=sign >= 0) for mesh in probes]
-    points = [np.hstack([scale * sample[:, :3], sample[:, 3:]]) for sample in points]
+    points = [_sampled(mesh, scale, sign) for mesh in probes]
 
-    fits = [] if bodies is None else fit_posed_bodies([sample[:, :3] for sample in points], bodies)
+    bodies = [] if motion is None else motion.surfaces()
+    fits = fit_posed_bodies([sample[:, :3] for sample in points], bodies) if bodies else []
     by_poses = bool(fits) and fits[0][0] < TRUSTED_POSES_M
     if by_poses:
         axes, axes_ratio, mirror_ratio = _choose_by_poses(fits, inside_out=sign < 0)
@@ -166,16 +174,31 @@ def survey_take(
         axes, axes_ratio = _choose_by_mannequin(find_up(points))
         mirror_ratio = None
     flip = (sign < 0) != bool(np.linalg.det(axes) < 0)
-    placed = [sample[:, :3] @ axes.T for sample in points]
-    if by_poses and bodies is not None:
-        floor, exact = _floor_by_poses(placed, bodies), True
-    else:
-        floor, exact = _floor_by_feet([np.hstack([p, s[:, 3:] @ axes.T]) for p, s in zip(placed, points, strict=True)])
+    turn = np.kron(np.eye(2), axes)
+    placed = [sample @ turn.T for sample in points]
+    survey = Survey(
+        Placement(scale, axes, flip), units, size_ratio, axes_ratio, mirror_ratio, sign, 0.0, False, by_poses
+    )
+    if by_poses and motion is not None:
+        rise = floor_by_poses([sample[:, :3] for sample in placed], bodies) - motion.floor()
+        bare = [_sampled(mesh, scale, sign, count=BARE_POINTS) @ turn.T for mesh in motion.bare]
+        person = fit_person(motion, [sample / UNIT_NORMALS for sample in bare], rise_m=rise)
+        ratio = person.difference_m / (MAX_PERSON_M if motion.cloth_known else MAX_PERSON_DRESSED_M)
+        survey = replace(survey, person_ratio=ratio, person_m=person.difference_m)
+        if ratio <= 1:
+            return _with_floor(survey, person.floor_m, exact=True)
+    return _with_floor(survey, *_floor_by_feet(placed))
+
+
+def _sampled(mesh: Mesh, scale: float, sign: float, *, count: int = PROBE_POINTS) -> np.ndarray:
+    sample = sample_surface(mesh, outward=sign >= 0, count=count)
+    return np.hstack([scale * sample[:, :3], sample[:, 3:]])
+
+
+def _with_floor(survey: Survey, floor: float, exact: bool) -> Survey:
     lift = -floor if exact and abs(floor) > MAX_FLOOR_M else 0.0
-    return Survey(
-        Placement(scale, axes, flip, lift), units, size_ratio, axes_ratio, mirror_ratio, sign, floor, exact,
-        by_poses,
-    )  # fmt: skip
+    placement = replace(survey.placement, lift_m=lift)
+    return replace(survey, placement=placement, floor_m=floor, floor_exact=exact)
 
 
 def _area(mesh: Mesh) -> float:
@@ -204,29 +227,6 @@ def _choose_by_mannequin(fits: dict[int, MannequinFit]) -> tuple[np.ndarray, flo
     costs = {up: fit.misfit_m * {1: 1.0, 4: FAULT}.get(up, 1.06) for up, fit in fits.items()}
     other = min(cost for up, cost in costs.items() if up != 1)
     return upright(min(costs, key=lambda up: costs[up])), costs[1] / other
-
-
-def _floor_by_poses(placed: list[np.ndarray], bodies: Sequence[np.ndarray]) -> float:
-    """How much too high the scans stand: their lift over the posed bodies, and that of the bodies over the floor."""
-    trees = [KDTree(np.asarray(body, np.float64)) for body in bodies]
-
-    def misfit(rise: float) -> float:
-        return float(
-            np.mean(
-                [
-                    np.minimum(
-                        tree.query(points + np.array([0, rise, 0]), distance_upper_bound=CLIP_M)[0], CLIP_M
-                    ).mean()
-                    for tree, points in zip(trees, placed, strict=True)
-                ]
-            )
-        )
-
-    rises = np.arange(-1.6, 1.601, 0.08)
-    rise = min(rises, key=lambda value: (misfit(value), abs(value)))
-    for step in (0.03, 0.012, 0.005):
-        rise = min((rise - 2 * step, rise - step, rise, rise + step, rise + 2 * step), key=misfit)
-    return float(np.median([body[:, 1].min() for body in bodies])) - float(rise)
 
 
 def _floor_by_feet(placed: list[np.ndarray]) -> tuple[float, bool]:
@@ -402,46 +402,3 @@ def _capsule(start: np.ndarray, end: np.ndarray, first: float, last: float) -> n
         normal *= NORMAL_M / np.linalg.norm(normal, axis=1, keepdims=True)
         rings.append(np.hstack([start + along * axis + radius * ring, normal]))
     return np.concatenate(rings)
-
-
-# --- with motion capture ------------------------------------------------------------------------------------------
-
-
-def fit_posed_bodies(
-    probes: Sequence[Float[np.ndarray, "N 3"]], bodies: Sequence[Float[np.ndarray, "verts 3"]]
-) -> list[tuple[float, Float64[np.ndarray, "3 3"]]]:
-    """Try every signed permutation of the axes against the posed bodies of the probes' frames.
-
-    Args:
-        probes: points on scans, metres, in file axes.
-        bodies: posed body surface of each.
-    Returns:
-        The misfit, metres, and the permutation, for all 48; the best first. A common shift of the take is let pass.
-    """
-    trees = [KDTree(np.asarray(body, np.float64)) for body in bodies]
-    fits = []
-    for order in itertools.permutations(range(3)):
-        for signs in itertools.product((1.0, -1.0), repeat=3):
-            axes = np.zeros((3, 3))
-            axes[range(3), order] = signs
-            fits.append((_misfit([points @ axes.T for points in probes], bodies, trees), axes))
-    return sorted(fits, key=lambda fit: fit[0])
-
-
-def _misfit(probes: list[np.ndarray], bodies: Sequence[np.ndarray], trees: list[KDTree]) -> float:
-    starts = (np.zeros(3), np.mean([b.mean(axis=0) - p.mean(axis=0) for p, b in zip(probes, bodies, strict=True)], 0))
-    best = np.inf
-    for shift in starts:
-        for step in range(4):
-            misfits, moves = [], []
-            for points, body, tree in zip(probes, bodies, trees, strict=True):
-                distance, nearest = tree.query(points + shift, distance_upper_bound=0.5)
-                near = np.isfinite(distance)
-                misfits.append(np.minimum(distance, CLIP_M).mean())
-                if near.any():
-                    moves.append((body[np.asarray(nearest)[near]] - points[near] - shift).mean(axis=0))
-            best = min(best, float(np.mean(misfits)))
-            if step == 3 or not moves:
-                break
-            shift = shift + np.mean(moves, axis=0)
-    return best

@@ -29,6 +29,7 @@ __all__ = [
     "hole_share",
     "measure_frame",
     "outwardness",
+    "rig_middle",
     "surface_noise",
     "surface_shift",
     "to_lab",
@@ -38,6 +39,7 @@ Colour = tuple[int, int, int]
 
 NOISE_SAMPLES, NOISE_NEIGHBOURS = 600, 12
 SHIFT_SAMPLES = 1500
+RIG_SAMPLES, RIG_STEP_M = 200, 0.3
 STRAY_DISTANCE_M = 0.06
 """Paint farther from the cloth than this is on something else: bands are a few centimetres wide."""
 LARGEST_HOLE_M = 0.6
@@ -101,6 +103,8 @@ class FrameStatistics:
     colours: ColourStatistics | None = None
     camera_share: float | None = None
     """Share of the rig's cameras in whose images the garment lies, all of the subject if its colour is not known."""
+    best_share: float | None = None
+    """The same had the subject stood in the middle of the rig."""
     shift_m: float | None = None
     """How far the fastest parts of the surface moved since the frame before ..."""
     shift_from: int | None = None
@@ -137,7 +141,7 @@ def measure_frame(
         labels = _labels(scan.colours, paints)
         colours = colour_statistics(scan, labels, paints)
         dressed = labels > OTHER
-    garment = vertices[dressed] if dressed.mean() > 0.05 else vertices
+    garment = (vertices[dressed] if dressed.mean() > 0.05 else vertices)[::7]
     bare = vertices[~dressed] if dressed.mean() < 0.85 else vertices
     return FrameStatistics(
         frame_id=scan.frame_id,
@@ -152,7 +156,8 @@ def measure_frame(
         hole_share=hole_share(mesh),
         content=hashlib.sha256(mesh.vertices.tobytes()).hexdigest()[:16],
         colours=colours,
-        camera_share=None if rig is None else float(camera_counts(rig, garment[::7]).mean() / max(len(rig.names), 1)),
+        camera_share=None if rig is None else float(camera_counts(rig, garment).mean() / max(len(rig.names), 1)),
+        best_share=None if rig is None else _best_share(rig, garment),
         pose_distance_m=None if body is None else _mean_distance(bare, body),
     )
 
@@ -243,6 +248,25 @@ def camera_counts(rig: Rig, points: Float[np.ndarray, "points 3"]) -> np.ndarray
         u, v = pixels[:, 0] / depth, pixels[:, 1] / depth
         counts += (seen[:, 2] > 0) & (u > -0.5) & (u < width - 0.5) & (v > -0.5) & (v < height - 0.5)
     return counts
+
+
+def rig_middle(rig: Rig) -> Float64[np.ndarray, " 3"]:
+    """The point nearest to all optical axes, in the least squares sense; where it is not determined, that nearest to
+    the cameras' mean."""
+    axes = rig.T_camera_world[:, 2, :3]
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    start = rig.centres.mean(axis=0)
+    away = np.einsum("cab,cb->a", across, rig.centres - start)
+    return start + np.linalg.pinv(across.sum(axis=0), rcond=1e-6) @ away
+
+
+def _best_share(rig: Rig, points: np.ndarray) -> float:
+    """Share of the cameras that would see the points, moved about the middle of the rig: the best of a few places."""
+    few = points[:: max(1, len(points) // RIG_SAMPLES)]
+    home = (rig_middle(rig) - few.mean(axis=0)) * (1, 0, 1)
+    steps = (-RIG_STEP_M, 0.0, RIG_STEP_M)
+    shares = [camera_counts(rig, few + home + (x, 0.0, z)).mean() for x in steps for z in steps]
+    return float(max(shares) / max(len(rig.names), 1))
 
 
 # --- colours -----------------------------------------------------------------------------------------------------

@@ -76,12 +76,25 @@ def _learned(path: Path, garment: Colour | None, boundary: tuple[tuple[str, Colo
 
 
 def _some_scans(capture: Capture) -> list[Scan]:
-    """The first scan, and others spread over the take that can be read."""
-    rows = np.unique(np.linspace(0, len(capture.frame_ids) - 1, FRAMES).round().astype(int)).tolist()
-    scans = [read_scan(capture, capture.frame_ids[0])]
-    for row in rows[1:]:
+    """The first scan that can be read, and others spread over the rest of the take; damaged ones are passed over.
+
+    Raises:
+        InputError: none can be read; about the first.
+    """
+    scans: list[Scan] = []
+    faults: list[InputError] = []
+    frame_ids = list(capture.frame_ids)
+    while frame_ids and not scans:
         try:
-            scans.append(read_scan(capture, capture.frame_ids[row]))
+            scans.append(read_scan(capture, frame_ids.pop(0)))
+        except InputError as error:
+            faults.append(error)
+    if not scans:
+        raise faults[0]
+    rows = np.unique(np.linspace(0, len(frame_ids), FRAMES).round().astype(int)[1:]) - 1
+    for row in rows[rows >= 0].tolist():
+        try:
+            scans.append(read_scan(capture, frame_ids[row]))
         except InputError:  # the frame itself will be flagged
             continue
     return scans

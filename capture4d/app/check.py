@@ -13,8 +13,20 @@ from typing import Any
 
 import numpy as np
 
-from capture4d.app.check_take import Claims, TakeFolder, open_take, posed_body, read_frame, time_stamp
+from capture4d.app.check_take import (
+    Claims,
+    TakeFolder,
+    body_state,
+    open_take,
+    posed_body,
+    read_frame,
+    time_stamp,
+    tracked_model,
+)
+from capture4d.garment_extraction import OTHER, classify_colours
+from capture4d.polygons import MeshFile
 from capture4d.preflight import BadFrame, Verdict, judge, true_rate
+from capture4d.scan_motion import Motion
 from capture4d.scan_placement import Placement, Survey, place, place_rig, sample_surface, survey_take
 from capture4d.scan_statistics import FrameStatistics, Paints, camera_counts, measure_frame, surface_shift
 from capture4d.types import Mesh, Rig, Scan
@@ -29,6 +41,10 @@ SUSPECTS = 60
 """Files of odd sizes that a sample holds beyond that."""
 RUN = 16
 """Frames of a job."""
+LEARNED = (
+    "No garment_colour is given: extract and track will learn the colours from the scans. "
+    "Garment and borders are not looked at here without --garment-colour and --border-colour."
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,20 +114,39 @@ def _survey(take: TakeFolder) -> Survey | None:
     has_body = take.poses_path is not None and take.body_path is not None
     known = [number for number in take.files if not (has_body and posed) or number in set(posed or ())]
     candidates = known or list(take.files)
-    probes: list[tuple[int, Mesh]] = []
+    probes: list[tuple[int, MeshFile]] = []
     for part in np.array_split(np.array(candidates), min(PROBES, len(candidates))):
         for number in part[:20].tolist():
             found = read_frame(take.files[number], number)
             if not isinstance(found, BadFrame):
-                probes.append((number, found.mesh))
+                probes.append((number, found))
                 break
     if not probes:
         return None
-    bodies = None
-    if known and take.poses_path is not None and take.body_path is not None:
-        posed_bodies = [posed_body(take.poses_path, take.body_path, number) for number, _ in probes]
-        bodies = [body for body in posed_bodies if body is not None]
-    return survey_take([mesh for _, mesh in probes], take.facts.declared, bodies or None)
+    return survey_take([found.mesh for _, found in probes], take.facts.declared, _motion(take, probes))
+
+
+def _motion(take: TakeFolder, probes: Sequence[tuple[int, MeshFile]]) -> Motion | None:
+    """Motion capture in the probe frames, and what of them is not the garment."""
+    if take.poses_path is None or take.body_path is None:
+        return None
+    states = [body_state(take.poses_path, take.body_path, number) for number, _ in probes]
+    posed = [state for state in states if state is not None]
+    if len(posed) < len(probes):
+        return None
+    bare = [_bare(found, take.facts.paints) for _, found in probes]
+    known = all(mesh is not None for mesh in bare)
+    meshes = [mesh for mesh in bare if mesh is not None] if known else [found.mesh for _, found in probes]
+    return Motion(tracked_model(take.poses_path, take.body_path), posed, meshes, known)
+
+
+def _bare(found: MeshFile, paints: Paints) -> Mesh | None:
+    """What of a scan is neither garment nor paint; None if that cannot be told, or is next to nothing."""
+    if found.colours is None or paints.garment is None:
+        return None
+    labels = classify_colours(found.colours, paints.garment, paints.borders)
+    bare = (labels[found.mesh.faces] == OTHER).all(axis=1)
+    return Mesh(found.mesh.vertices, found.mesh.faces[bare]) if 0.1 < bare.mean() < 0.98 else None
 
 
 def _rig_of_scans(take: TakeFolder, placement: Placement) -> tuple[Rig, bool]:
@@ -228,6 +263,7 @@ def as_json(checked: Checked, *, fixed: Path | None = None) -> dict[str, Any]:
         "status": ("clean", "warnings", "errors")[exit_code(checked.verdict)],
         "frames": len(checked.take.files),
         "frames_checked": checked.frames,
+        "colours": "learned" if _learns(checked) else "given",
         "findings": [
             {
                 "code": finding.code,
@@ -244,20 +280,27 @@ def as_json(checked: Checked, *, fixed: Path | None = None) -> dict[str, Any]:
     }
 
 
+def _learns(checked: Checked) -> bool:
+    """The take does not say which colour its garment has."""
+    return checked.take.facts.paints.garment is None
+
+
 def print_table(checked: Checked) -> None:
     from rich.console import Console
     from rich.table import Table
 
     console = Console()
     looked = f"{checked.frames} of {len(checked.take.files)} frames"
-    if not checked.verdict.findings:
+    if checked.verdict.findings:
+        table = Table("", "finding", "what was found", "what to do", title=f"{checked.take.path} ({looked} looked at)")
+        for finding in checked.verdict.findings:
+            frames = f"\nframes {_ranges(finding.frames)}" if finding.frames else ""
+            table.add_row(finding.severity, finding.code, finding.found + frames, finding.advice)
+        console.print(table)
+    else:
         console.print(f"{checked.take.path}: clean ({looked} looked at)", highlight=False, soft_wrap=True)
-        return
-    table = Table("", "finding", "what was found", "what to do", title=f"{checked.take.path} ({looked} looked at)")
-    for finding in checked.verdict.findings:
-        frames = f"\nframes {_ranges(finding.frames)}" if finding.frames else ""
-        table.add_row(finding.severity, finding.code, finding.found + frames, finding.advice)
-    console.print(table)
+    if _learns(checked):
+        console.print(LEARNED, highlight=False, soft_wrap=True)
 
 
 def _ranges(numbers: Sequence[int], most: int = 6) -> str:

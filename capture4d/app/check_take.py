@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from capture4d.body import ShapedBody, pose_frame, with_shape
+from capture4d.body_tracking_jacobian import BodyState, TrackedBody, tracked_body
 from capture4d.errors import EmptyMeshError, InputError, NotFiniteError
 from capture4d.mesh_files import MESH_SUFFIXES, read_coloured_mesh
 from capture4d.polygons import MeshFile
@@ -26,7 +27,7 @@ from capture4d.scans import parse_colour
 from capture4d.types import PoseSequence, Rig
 from capture4d.workdir import read_json
 
-__all__ = ["Claims", "TakeFolder", "open_take", "posed_body", "read_frame", "time_stamp"]
+__all__ = ["Claims", "TakeFolder", "body_state", "open_take", "posed_body", "read_frame", "time_stamp", "tracked_model"]
 
 _STAMP = re.compile(rb"^\s*(?:comment|obj_info|#)\s+time(?:[_ ]?stamp)?\s*[:=]?\s+([-+.\deE]+)\s*(?:s|sec)?\s*$", re.M)
 
@@ -190,6 +191,22 @@ def posed_body(poses_path: Path, body_path: Path, frame_id: int) -> np.ndarray |
     """
     shaped, poses, rows = _motion(poses_path, body_path)
     return pose_frame(shaped, poses, rows[frame_id]).vertices() if frame_id in rows else None
+
+
+def body_state(poses_path: Path, body_path: Path, frame_id: int) -> BodyState | None:
+    """Pose and shape of a frame; None without a pose for it."""
+    shaped, poses, rows = _motion(poses_path, body_path)
+    if frame_id not in rows:
+        return None
+    shape = np.zeros(len(shaped.body.shape_directions))
+    shape[: len(shaped.shape)] = shaped.shape
+    row = rows[frame_id]
+    return BodyState(poses.rotations[row].astype(np.float64), poses.translations[row].astype(np.float64), shape)
+
+
+def tracked_model(poses_path: Path, body_path: Path) -> TrackedBody:
+    """The body of the motion capture, as tracking has it."""
+    return tracked_body(_motion(poses_path, body_path)[0].body)
 
 
 @lru_cache(maxsize=1)

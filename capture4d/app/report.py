@@ -306,6 +306,7 @@ def _tracking_part(tracked: Tracking | None) -> dict[str, Any] | None:
             for each in flagged[:MAX_FLAGGED_ROWS]
         ],
         "left_out": max(0, len(flagged) - MAX_FLAGGED_ROWS),
+        "unseen": [f"{limb} ({count} of {len(tracked.records)} frames)" for limb, count in tracked.unseen],
     }
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -96,6 +97,8 @@ class Tracking:
     section: Section
     records: Sequence[Mapping[str, Any]]
     metrics: Mapping[str, float | None]
+    unseen: Sequence[tuple[str, int]]
+    """Limbs that were not scanned, and in how many frames; most often first."""
 
     def flagged(self) -> list[Mapping[str, Any]]:
         return [record for record in self.records if record["verdict"] != "good"]
@@ -129,7 +132,8 @@ def tracking(capture: Capture, work: Path) -> Tracking | None:
         "track_cpu_s": ("s", "CPU a frame, median"),
     }
     tiles = [(_shown(metrics[key]), unit, name) for key, (unit, name) in names.items() if key in metrics]
-    return Tracking(Section(tiles, list(_tracking_charts(records))), records, metrics)
+    unseen = Counter(limb for record in records for limb in record["unseen"]).most_common()
+    return Tracking(Section(tiles, list(_tracking_charts(records))), records, metrics, unseen)
 
 
 def _measure_joints(folder: Path, truth: PoseSequence, records: Sequence[dict[str, Any]]) -> None:

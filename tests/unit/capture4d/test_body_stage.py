@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 
 from benchmarks.dressed_body import dress_body
 from capture4d.body import pose_frame, with_shape
@@ -14,6 +16,7 @@ from capture4d.body_anny import load_anny
 from capture4d.body_stage import load_tracking, run, tracking_digest
 from capture4d.body_tracking_config import TrackingConfig
 from capture4d.errors import InputError
+from capture4d.mesh import submesh
 from capture4d.motion_retarget import pose_sequence
 from capture4d.records import save_body, save_poses
 from capture4d.scans import Capture, write_capture_description, write_scan
@@ -23,8 +26,12 @@ from capture4d.workdir import read_json
 CLOTH, SUIT = (47, 98, 201), (150, 152, 156)
 
 
-def dressed_capture(folder: Path, frames: int) -> PoseSequence:
-    """Noise-free scans of the built-in body that raises its arms, and the poses, which are not in the capture."""
+def dressed_capture(folder: Path, frames: int, *, without: dict[int, tuple[str, ...]] | None = None) -> PoseSequence:
+    """Noise-free scans of the built-in body that raises its arms, and the poses, which are not in the capture.
+
+    Args:
+        without: joints, by row of the frame, whose part of the body the scan lacks.
+    """
     body = load_anny()
     person = with_shape(body, np.array([0.6, -0.4], np.float32))
     rotations = np.tile(np.eye(3), (frames, len(body.joint_names), 1, 1))
@@ -38,6 +45,11 @@ def dressed_capture(folder: Path, frames: int) -> PoseSequence:
     for row, frame_id in enumerate(capture.frame_ids):
         dressed = dress_body(pose_frame(person, poses, row), 0.1 * row)
         bare, cloth = dressed.body, dressed.garment
+        lost = [body.joint_names.index(name) for name in (without or {}).get(row, ())]
+        if lost:
+            skin = pose_frame(person, poses, row).vertices()
+            weight = body.skin_weights[:, lost].sum(axis=1)[KDTree(skin).query(bare.vertices)[1]]
+            bare = submesh(bare, (weight[bare.faces] < 0.05).all(axis=1))[0]
         mesh = Mesh(
             np.concatenate([bare.vertices, cloth.vertices]),
             np.concatenate([bare.faces, cloth.faces + np.int32(len(bare.vertices))]),
@@ -68,6 +80,27 @@ def test_a_take_is_tracked_and_a_run_that_was_cut_short_ends_the_same(tmp_path: 
     (tmp_path / "work" / "body" / "refined" / "000006.npz").unlink()
     assert run(tmp_path / "capture", tmp_path / "work" / "body", config) == digest
     assert tracking_digest(tmp_path / "work" / "body", tmp_path / "capture") == digest
+
+
+@pytest.mark.slow
+def test_a_frame_says_which_limbs_nobody_scanned_and_what_is_wrong_with_its_scan(tmp_path: Path) -> None:
+    arm = ("lowerarm01.R", "lowerarm02.R", "wrist.R")
+    truth = dressed_capture(tmp_path / "capture", 5, without={2: arm})
+    save_poses(tmp_path / "start.npz", truth)
+    for frame in ("000005", "000009"):
+        path = tmp_path / "capture" / "scans" / f"{frame}.ply"
+        path.write_bytes(path.read_bytes()[:5000])
+    run(tmp_path / "capture", tmp_path / "body", TrackingConfig(start=str(tmp_path / "start.npz")))
+    records = [json.loads(line) for line in (tmp_path / "body" / "metrics.jsonl").read_text().splitlines()]
+    assert [record["verdict"] for record in records] == ["lost", "good", "check", "good", "lost"]
+    assert [record["unseen"] for record in records[1:4]] == [[], ["right forearm", "right hand"], []]
+    assert records[2]["reasons"] == ["not scanned, so guessed: right forearm, right hand"]
+    for record, name in ((records[0], "000005.ply"), (records[4], "000009.ply")):
+        assert f"{name}: cut off" in record["reasons"][0]
+    body, found = load_tracking(tmp_path / "body")
+    here, there = with_shape(body, found.shape), with_shape(body, truth.shape)
+    apart = pose_frame(here, found, 0).vertices() - pose_frame(there, truth, 0).vertices()
+    assert np.linalg.norm(apart, axis=1).mean() < 0.02, "a lost first frame has the pose of the next one"
 
 
 def test_a_start_that_is_no_file_and_a_stage_that_was_not_run(tmp_path: Path) -> None:

@@ -14,7 +14,9 @@ import pytest
 
 from capture4d.app.cli import main
 from capture4d.errors import InputError
+from capture4d.garment_stage import load_garment_scan
 from capture4d.mesh_files import read_mesh, write_mesh
+from capture4d.ply_format import ply_bytes
 from capture4d.records import load_garment, save_garment, save_poses
 from capture4d.types import Mesh, PoseSequence
 from capture4d.workdir import write_bytes, write_json
@@ -145,39 +147,68 @@ def test_missing_capture(work: Path, capsys: pytest.CaptureFixture[str]):
     assert not work.exists()
 
 
-def test_bad_scans_are_named(tube_capture: Path, work: Path, capsys: pytest.CaptureFixture[str]):
-    path = tube_capture / "scans" / "000006.ply"
-    good = path.read_bytes()
-    found = read_mesh(path)
-
-    path.write_bytes(good[: len(good) // 2])
-    assert "000006.ply: cut off" in fails(capsys, *extract(tube_capture, work))
-
-    write_mesh(path, found.mesh)
-    assert "000006.ply: expected a colour per vertex" in fails(capsys, *extract(tube_capture, work / "2"))
-
-    write_mesh(path, Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)), colours=np.zeros((0, 3), np.uint8))
-    assert "000006.ply: empty mesh" in fails(capsys, *extract(tube_capture, work / "3"))
-
+def damaged(path: Path) -> dict[str, bytes]:
+    """What may have become of a good scan, by what is said of it."""
+    good, found = path.read_bytes(), read_mesh(path)
     head, body = good.split(b"end_header\n")
-    path.write_bytes(head + b"end_header\n" + np.float32(np.nan).tobytes() + body[4:])
-    assert "expected finite numbers, found NaN" in fails(capsys, *extract(tube_capture, work / "4"))
+    empty = Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
+    return {
+        "000006.ply: cut off": good[: len(good) // 2],
+        "000006.ply: expected a colour per vertex": ply_bytes(found.mesh, None, None),
+        "000006.ply: empty mesh": ply_bytes(empty, np.zeros((0, 3), np.uint8), None),
+        "expected finite numbers, found NaN": head + b"end_header\n" + np.float32(np.nan).tobytes() + body[4:],
+        "000006.ply: ": b"",
+    }
 
-    path.unlink()
-    assert "000006.ply: no such scan" in fails(capsys, *extract(tube_capture, work / "5"))
+
+def test_a_damaged_scan_is_flagged_and_the_take_goes_on(
+    tube_capture: Path, work: Path, capsys: pytest.CaptureFixture[str]
+):
+    path = tube_capture / "scans" / "000006.ply"
+    for number, (said, data) in enumerate(damaged(path).items()):
+        path.write_bytes(data)
+        folder = work / str(number)
+        assert run(*extract(tube_capture, folder)) == 0
+        line = capsys.readouterr().err.splitlines()[-1]
+        assert line.startswith("capture4d: no garment in 1 frames, first in 6: ")
+        assert said in line
+        with np.load(folder / "garment" / "frames" / "000006.npz") as arrays:
+            assert said in str(arrays["reason"])
+        for frame in ("000005", "000007"):
+            assert len(load_garment_scan(folder / "garment" / "frames" / f"{frame}.npz", int(frame)).mesh.vertices)
+    assert run("register", tube_capture, "--output", folder, "--workers", "1") == 0
+    records = [json.loads(line) for line in (folder / "registration" / "metrics.jsonl").read_text().splitlines()]
+    assert [record["verdict"] == "failed" for record in records] == [False, True, False]
+    assert said in records[1]["reasons"][0]
 
 
-def test_a_repaired_scan_lets_the_same_command_go_on(
+def test_a_damaged_first_scan_is_flagged_too_and_nothing_but_damaged_scans_is_an_error(
+    tube_capture: Path, work: Path, capsys: pytest.CaptureFixture[str]
+):
+    scans = sorted((tube_capture / "scans").iterdir())
+    scans[0].write_bytes(b"")
+    assert run(*extract(tube_capture, work)) == 0
+    for scan in scans:
+        scan.write_bytes(b"ply")
+    assert "000005.ply: " in fails(capsys, *extract(tube_capture, work / "2"))
+    scans[1].unlink()
+    assert "000006.ply: no such scan" in fails(capsys, *extract(tube_capture, work / "3"))
+
+
+def test_a_repaired_scan_is_read_by_the_same_command(
     tube_capture: Path, work: Path, capsys: pytest.CaptureFixture[str]
 ):
     path = tube_capture / "scans" / "000007.ply"
     good = path.read_bytes()
     path.write_bytes(good[:-9] + b"\xff" * 9)  # same size: face 7 points nowhere
-    fails(capsys, *extract(tube_capture, work))
+    assert run(*extract(tube_capture, work)) == 0
+    assert "first in 7: " in capsys.readouterr().err
     done = work / "garment" / "frames" / "000005.npz"
     before = done.stat().st_mtime_ns
     path.write_bytes(good)
     assert run(*extract(tube_capture, work)) == 0
+    assert "no garment" not in capsys.readouterr().err
+    assert len(load_garment_scan(work / "garment" / "frames" / "000007.npz", 7).mesh.vertices)
     assert done.stat().st_mtime_ns == before
 
 

@@ -22,6 +22,7 @@ from capture4d.scan_statistics import (
     hole_share,
     measure_frame,
     outwardness,
+    rig_middle,
     surface_noise,
     surface_shift,
     to_lab,
@@ -160,6 +161,39 @@ def test_cameras_count_what_lies_in_their_images():
     )
     points = np.array([[0.0, 0, 1], [0.49, 0, 1], [0.6, 0, 1], [0, 0, -1]])
     np.testing.assert_array_equal(camera_counts(rig, points), [1, 1, 0, 0])
+
+
+def ring(cameras: int = 12, radius: float = 2.5) -> Rig:
+    """Cameras around the origin at shoulder height that look at it; a subject at the middle fills their images."""
+    angle = 2 * np.pi * np.arange(cameras) / cameras
+    T = np.tile(np.eye(4), (cameras, 1, 1))
+    T[:, 0, :3] = np.stack([np.cos(angle), 0 * angle, -np.sin(angle)], 1)
+    T[:, 1, :3] = (0, -1, 0)
+    T[:, 2, :3] = np.stack([-np.sin(angle), 0 * angle, -np.cos(angle)], 1)
+    T[:, :3, 3] = (0, 1.2, radius)
+    K = np.array([[600.0, 0, 256], [0, 600, 256], [0, 0, 1]])
+    sizes = np.full((cameras, 2), 513, np.int32)
+    names = tuple(f"cam{index:02d}" for index in range(cameras))
+    return Rig(names, np.tile(K, (cameras, 1, 1)), np.zeros((cameras, 5)), T, sizes)
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0, 0), (0.3, 0, -1.1)])
+def test_the_middle_of_a_rig_is_where_its_cameras_look(shift: tuple[float, float, float]):
+    rig = place_rig(ring(), Placement(axes=np.eye(3)))
+    rig.T_camera_world[:, :3, 3] -= rig.T_camera_world[:, :3, :3] @ np.array(shift)
+    np.testing.assert_allclose(rig_middle(rig), np.array([0, 1.2, 0]) + shift, atol=1e-9)
+    one = Rig(("a",), rig.intrinsics[:1], rig.distortion[:1], rig.T_camera_world[:1], rig.image_sizes[:1])
+    np.testing.assert_allclose(rig_middle(one), one.centres[0], atol=1e-9)
+
+
+@pytest.mark.parametrize(("distance", "wrong"), [(0.0, False), (0.5, False), (2.0, True), (4.0, True)])
+def test_a_subject_beside_the_rig_is_outside(distance: float, wrong: bool):
+    rig, frames = ring(), []
+    for number in range(1, 5):
+        scan = figure(12.0 * number)
+        mesh = scan.mesh.with_vertices(scan.mesh.vertices + np.array([0.6, 0, 0.8], np.float32) * distance)
+        frames.append(measure_frame(replace(scan, mesh=mesh, frame_id=number), PAINTS, rig=rig))
+    assert judged(frames) == ([("outside-volume", (1, 2, 3, 4))] if wrong else [])
 
 
 def test_a_rig_moves_with_its_scans():
@@ -307,7 +341,9 @@ def test_time_stamps_and_motion_capture_tell_the_rate():
 def test_a_sound_take_is_clean(sound: dict[int, Scan], tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     code, found = check(capsys, write(tmp_path / "take", sound))
     assert (code, found["status"], found["findings"]) == (0, "clean", [])
-    assert set(found) == {"format", "capture", "status", "frames", "frames_checked", "findings", "scores", "fixed"}
+    keys = {"format", "capture", "status", "frames", "frames_checked", "colours", "findings", "scores", "fixed"}
+    assert set(found) == keys
+    assert found["colours"] == "given"
     assert set(found["scores"]) <= set(CODES)
     assert all(0 <= score <= 1 for score in found["scores"].values())
 
@@ -372,8 +408,13 @@ def test_unusable_frames_are_left_out(sound: dict[int, Scan], tmp_path: Path, ca
 def test_a_folder_of_scans_is_enough(sound: dict[int, Scan], tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     for number, scan in sound.items():
         write_mesh(tmp_path / f"take_{number}_v2.ply", scan.mesh, colours=scan.colours)
-    code, found = check(capsys, tmp_path, "--frames", "take_{frame}_v2.ply", "--garment-colour", "#2f62c9")
-    assert (code, found["frames"]) == (0, 5)
+    command = (tmp_path, "--frames", "take_{frame}_v2.ply")
+    code, found = check(capsys, *command, "--garment-colour", "#2f62c9")
+    assert (code, found["frames"], found["colours"]) == (0, 5, "given")
+    assert check(capsys, *command)[1]["colours"] == "learned"
+    with pytest.raises(SystemExit):
+        main(["check", *map(str, command), "--workers", "1"])
+    assert "will learn the colours from the scans" in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.parametrize(

@@ -185,8 +185,8 @@ def test_tracking_is_shown_beside_the_truth(work):
     for index in range(FRAMES):
         seen = np.arange(len(body.joint_names)) < 5
         write_npz(work / "body" / "refined" / f"{index:06d}.npz", seen=seen)
-        lines.append({"frame_id": index, "verdict": "good", "reasons": [], "explained": 0.97, "median_m": 0.0008,
-                      "inside": 0.0, "started_from": "motion", "cpu_s": 0.2})  # fmt: skip
+        lines.append({"frame_id": index, "verdict": "good", "reasons": [], "unseen": ["left foot"], "explained": 0.97,
+                      "median_m": 0.0008, "inside": 0.0, "started_from": "motion", "cpu_s": 0.2})  # fmt: skip
     lines[3] |= {"verdict": "lost", "reasons": ["skin & suit are gone"], "median_m": None}
     write_bytes(work / "body" / "metrics.jsonl", "\n".join(json.dumps(line) for line in lines).encode())
     page = run(work, config=ReportConfig(pictures=1, stage_pictures=2)).read_text()
@@ -195,6 +195,7 @@ def test_tracking_is_shown_beside_the_truth(work):
     assert metrics["track_good_percent"] == pytest.approx(87.5)
     assert metrics["track_median_mm"] == pytest.approx(0.8)
     assert "skin &amp; suit are gone" in page
+    assert f"Not scanned, so guessed: left foot ({FRAMES} of {FRAMES} frames)." in page
     assert "Joints to their true places" in page
     assert page.count('alt="in the scan') == 4, "two frames from two sides"
 

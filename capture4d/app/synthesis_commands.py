@@ -1,0 +1,86 @@
+"""`capture4d demo`, `synth` and `scan`: captures that nobody filmed."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Positional, arg
+
+from capture4d.app.command_options import StageOptions
+from data_synth import config as synth_config
+from data_synth.scanner_config import ScanConfig
+
+__all__ = ["Demo", "Scan", "Synth"]
+
+
+def _with_sensor(config: Any, sensor: Literal["depth", "stereo"] | None) -> Any:
+    """Settings of a synthetic capture with another scanner, if one is given."""
+    if sensor is None:
+        return config
+    return dataclasses.replace(config, scanner=dataclasses.replace(config.scanner, sensor=sensor))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demo(StageOptions):
+    """Make a synthetic capture, register it, and report: the whole pipeline in minutes."""
+
+    output: Path = Path("out")
+    """Folder for everything, the capture included."""
+
+    def __call__(self) -> int:
+        from capture4d.app.pipeline import run_demo
+
+        print(f"report: {run_demo(self.output, workers=self.workers, overwrite=self.overwrite)}")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Synth(StageOptions):
+    """Simulate a garment on a moving body and scan it: a capture folder with its exact truth."""
+
+    output: Annotated[Positional[Path], arg(metavar="OUTPUT")]
+    """Capture folder to write."""
+    preset: Literal[*synth_config.PRESETS] = "demo"
+    """What the settings below start from."""
+    scanner: Literal["depth", "stereo"] | None = None
+    """Short for --scanner.sensor."""
+    config: Annotated[synth_config.SynthConfig, arg(name="")] = field(default_factory=synth_config.SynthConfig)
+
+    def __call__(self) -> int:
+        from data_synth.stage import run
+
+        run(self.output, _with_sensor(self.config, self.scanner), workers=self.workers, overwrite=self.overwrite)
+        print(f"capture: {self.output}")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scan(StageOptions):
+    """Scan your own mesh sequence with the virtual camera rig: a capture folder, with truth if the faces stay."""
+
+    meshes: Annotated[Positional[Path], arg(metavar="MESHES")]
+    """Folder of mesh files, one per frame in order of name; or .npz with vertices (T, V, 3) and faces (F, 3)."""
+    output: Annotated[Positional[Path], arg(metavar="OUTPUT")]
+    """Capture folder to write."""
+    template: Path | None = None
+    """Mesh to register later: lies on the first mesh, or is the same mesh in another pose."""
+    scanner: Literal["depth", "stereo"] | None = None
+    """Short for --scanner.sensor."""
+    config: Annotated[ScanConfig, arg(name="")] = field(default_factory=ScanConfig)
+
+    def __call__(self) -> int:
+        from data_synth.scan_stage import run
+
+        run(
+            self.meshes,
+            self.output,
+            _with_sensor(self.config, self.scanner),
+            template=self.template,
+            workers=self.workers,
+            overwrite=self.overwrite,
+        )
+        print(f"capture: {self.output}")
+        return 0
