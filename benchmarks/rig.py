@@ -14,7 +14,8 @@ The peer (`benchmarks/rig_peer.py`) calibrates each camera with OpenCV and chain
 - `ratio_on_opencv_corners`: both have the corners that OpenCV finds, outliers among them.
 
 Limits this was built against: camera centres 0.08 mm mean and 0.25 at most, rotations 0.02 deg at most, 0.02 mm rms
-when triangulating over the volume, 8 CPU seconds of adjustment, `ratio_to_opencv` 8; twice these errors for `sparse` and `wrong`; a camera moved by 0.5 mm or 0.02 deg is found.
+when triangulating over the volume, 8 CPU seconds of adjustment, `ratio_to_opencv` 8; twice these errors for `sparse`
+and `wrong`; a camera moved by 0.5 mm or 0.02 deg is found.
 """
 
 from __future__ import annotations

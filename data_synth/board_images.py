@@ -1,9 +1,9 @@
 """Photographs of a calibration board, through real lenses: distortion, blur, noise, tilt, and hands in the way.
 
 The corners of every pixel are traced to the plane of the board, through the inverse of the lens. Between them lies a
-quadrilateral, and the pixel is the mean of the pattern in it, by area: the pattern is cells of one tone between straight
-lines, so nothing is sampled and no edge is jagged. Then come a Gaussian blur for the lens, and Gaussian noise for the
-sensor.
+quadrilateral, and the pixel is the mean of the pattern in it, by area: the pattern is cells of one grey level between
+straight lines, so nothing is sampled, and no edge is jagged. Then come a Gaussian blur for the lens, and Gaussian noise
+for the sensor.
 """
 
 from __future__ import annotations
@@ -117,7 +117,8 @@ def _pattern(
     opencv = board.opencv()
     dictionary = opencv.getDictionary()
     cells = board.cells_per_marker
-    within = np.concatenate([[0], (board.square_m - board.marker_m) / 2 + np.arange(cells + 1) * board.marker_m / cells])
+    border = (board.square_m - board.marker_m) / 2
+    within = np.concatenate([[0], border + np.arange(cells + 1) * board.marker_m / cells])
     x, y = (
         np.concatenate(
             [
@@ -182,7 +183,7 @@ def _render(image, lens, T_board_camera, x_lines, y_lines, tones, hands, hand, s
 @no_type_check
 @njit(cache=True)
 def _trace(lens, T_board_camera, row, points):
-    """Where the rays through the upper corners of a row of pixels meet the board; NaN where they do not, or only far away."""
+    """Where rays through the upper corners of a row of pixels meet the board; NaN where they do not, or far away."""
     rotation, origin = T_board_camera[:3, :3], T_board_camera[:3, 3]
     i = row // LENS_STEP
     a = row / LENS_STEP - i
