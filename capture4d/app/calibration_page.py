@@ -161,7 +161,9 @@ def _summary(report: Mapping[str, Any]) -> list[tuple[str, str]]:
         corners = float(np.median([row["corner_rms_mm"] for row in measured]))
         worst = max(measured, key=lambda row: row["corner_rms_mm"])
         scale = max(abs(row["scale_ppm"]) for row in measured)
-        within = f"corners triangulated within {corners:.3f} mm rms, {worst['corner_rms_mm']:.3f} at pose {worst['name']}"
+        within = (
+            f"corners triangulated within {corners:.3f} mm rms, {worst['corner_rms_mm']:.3f} at pose {worst['name']}"
+        )
         rows.append(("volume", f"{len(measured)} poses, {within}; scale within {scale:.0f} ppm"))
     if report["flatness"]:
         flat = report["flatness"]
