@@ -7,9 +7,10 @@ edges; every camera is reached from the first along the best-seen views (Dijkstr
 
 from __future__ import annotations
 
+import contextlib
 import heapq
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import cv2
 import numpy as np
@@ -71,15 +72,27 @@ def start_rig(
     count = len(names)
     intrinsics, distortion = np.zeros((count, 3, 3)), np.zeros((count, 5))
     T_camera_board: dict[tuple[int, int], np.ndarray] = {}
-    for camera in range(count):
-        own = [view for view in views if view.camera == camera]
-        size = int(image_sizes[camera, 0]), int(image_sizes[camera, 1])
-        intrinsics[camera], distortion[camera], placed = _calibrate_camera(own, board, size, names[camera])
-        T_camera_board |= {(camera, view.pose): matrix for view, matrix in zip(own, placed, strict=True)}
+    with _one_thread():
+        for camera in range(count):
+            own = [view for view in views if view.camera == camera]
+            size = int(image_sizes[camera, 0]), int(image_sizes[camera, 1])
+            intrinsics[camera], distortion[camera], placed = _calibrate_camera(own, board, size, names[camera])
+            T_camera_board |= {(camera, view.pose): matrix for view, matrix in zip(own, placed, strict=True)}
     weights = {(view.camera, view.pose): len(view.ids) for view in views}
     T_camera_world, T_world_board = _chain(T_camera_board, weights, count, poses)
     rig = Rig(tuple(names), intrinsics, distortion, T_camera_world, np.asarray(image_sizes, np.int32))
     return RigEstimate(rig, T_world_board, board.corners)
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """OpenCV's sums in the same order every time: on several threads, two calibrations of the same corners differ."""
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(threads)
 
 
 def _calibrate_camera(

@@ -1,7 +1,9 @@
 """Photographs of a calibration board, through real lenses: distortion, blur, noise, tilt, and hands in the way.
 
-Every pixel is the mean of a grid of rays through the inverse of the lens, each tested against the exact pattern, which
-has no texels; then a Gaussian blur for the lens, and Gaussian noise for the sensor.
+The corners of every pixel are traced to the plane of the board, through the inverse of the lens. Between them lies a
+quadrilateral, and the pixel is the mean of the pattern in it, by area: the pattern is cells of one grey level between
+straight lines, so nothing is sampled, and no edge is jagged. Then come a Gaussian blur for the lens, and Gaussian noise
+for the sensor.
 """
 
 from __future__ import annotations
@@ -11,7 +13,7 @@ from typing import no_type_check
 
 import cv2
 import numpy as np
-from jaxtyping import Float64, Int32, UInt8
+from jaxtyping import Float64, UInt8
 from numba import njit
 
 from capture4d.calibration_board import Board
@@ -23,13 +25,8 @@ __all__ = ["DEFAULT", "BoardImageConfig", "photograph_board"]
 LENS_STEP = 4
 """The inverse of the lens is computed at every 4th pixel and interpolated, to within a thousandth of a pixel."""
 NEAREST_M = 0.05
-RAYS, RAY_STEP = 21, 13
-"""Averaged in a pixel, on a Fibonacci lattice."""
-ROW_SHIFT, COLUMN_SHIFT = (0.7548776662, 0.5698402910), (0.4142135624, 0.7320508076)
-"""Of the lattice, in x and in y, from row to row and from column to column: irrational, so that no edge runs along the
-rays. With the same rays in every pixel, edges along rows or diagonals would move corners by hundredths of a pixel."""
-BLACK = -1
-"""In the table of squares: no marker, all ink."""
+FAR_M = 1e6
+"""Where the outermost cells of the pattern end, the background."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,16 +72,15 @@ def photograph_board(
         low = np.clip(np.floor(pixels.min(axis=0)).astype(int) - 2, 0, (width, height))
         high = np.clip(np.ceil(pixels.max(axis=0)).astype(int) + 3, 0, (width, height))
         if (high > low).all():
-            squares, bits = _pattern(board)
+            T_board_camera = np.linalg.inv(T_camera_board)
             _render(
                 image[low[1] : high[1], low[0] : high[0]],
                 _inverse_lens(rig, camera, low, high),
-                np.linalg.inv(T_camera_board),
-                squares,
-                bits,
-                np.array([board.square_m, board.marker_m, config.margin_m, config.hand_radius_m]),
-                np.array([config.ink, config.paper, config.background]),
+                T_board_camera,
+                *_pattern(board, config, printed_side=bool(T_board_camera[2, 3] < 0)),
                 hands,
+                config.hand_radius_m,
+                config.background,
             )
     blurred = cv2.GaussianBlur(image, (0, 0), config.blur_px) if config.blur_px > 0 else image
     noisy = blurred + rng.normal(0, config.noise, blurred.shape).astype(np.float32)
@@ -114,77 +110,140 @@ def _inverse_lens(rig: Rig, camera: int, low: np.ndarray, high: np.ndarray) -> F
     return undistort(pixels, rig.intrinsics[camera], rig.distortion[camera]).reshape(*u.shape, 2)
 
 
-def _pattern(board: Board) -> tuple[Int32[np.ndarray, "rows columns"], UInt8[np.ndarray, "markers cells cells"]]:
-    """Which marker lies in each square, or BLACK; and the cells of each marker, 1 for paper."""
+def _pattern(
+    board: Board, config: BoardImageConfig, *, printed_side: bool
+) -> tuple[Float64[np.ndarray, " across"], Float64[np.ndarray, " down"], Float64[np.ndarray, "rows columns"]]:
+    """The sheet as cells of one grey level each: the lines between them in x and in y, metres, and the levels."""
     opencv = board.opencv()
     dictionary = opencv.getDictionary()
-    cells = dictionary.markerSize + 2
-    squares = np.full((board.rows, board.columns), BLACK, np.int32)
-    markers = opencv.getIds().ravel()
-    for marker, outline in zip(markers, opencv.getObjPoints(), strict=True):
+    cells = board.cells_per_marker
+    border = (board.square_m - board.marker_m) / 2
+    within = np.concatenate([[0], border + np.arange(cells + 1) * board.marker_m / cells])
+    x, y = (
+        np.concatenate(
+            [
+                [-FAR_M, -config.margin_m],
+                (np.arange(count)[:, None] * board.square_m + within).ravel(),
+                [count * board.square_m, count * board.square_m + config.margin_m, FAR_M],
+            ]
+        )
+        for count in (board.columns, board.rows)
+    )
+    tones = np.full((len(y) - 1, len(x) - 1), config.background)
+    tones[1:-1, 1:-1] = config.paper
+    if not printed_side:
+        return x, y, tones
+    per_square = len(within)
+    squares = tones[2:-2, 2:-2].reshape(board.rows, per_square, board.columns, per_square).swapaxes(1, 2)
+    squares[:] = config.ink
+    for marker, outline in zip(opencv.getIds().ravel(), opencv.getObjPoints(), strict=True):
         column, row = (np.asarray(outline)[:, :2].mean(axis=0) / board.square_m).astype(int)
-        squares[row, column] = marker
-    bits = np.stack([dictionary.generateImageMarker(int(marker), cells) > 127 for marker in markers])
-    return squares, bits.astype(np.uint8)
+        bits = dictionary.generateImageMarker(int(marker), cells) > 127
+        squares[row, column] = config.paper
+        squares[row, column, 1:-1, 1:-1] = np.where(bits, config.paper, config.ink)
+    tones[2:-2, 2:-2] = squares.swapaxes(1, 2).reshape(board.rows * per_square, board.columns * per_square)
+    return x, y, tones
 
 
-@no_type_check  # keeps the type-checking import hook off the function that numba compiles
+@no_type_check  # keeps the type-checking import hook off the functions that numba compiles
 @njit(cache=True)
-def _render(image, lens, T_board_camera, squares, bits, lengths, greys, hands):
-    """Average RAYS in every pixel of a window."""
-    square, marker, margin, hand = lengths
-    ink, paper, skin = greys
-    rows, columns = squares.shape
-    cells = bits.shape[1]
-    border = (square - marker) / 2
-    rotation, origin = T_board_camera[:3, :3], T_board_camera[:3, 3]
+def _render(image, lens, T_board_camera, x_lines, y_lines, tones, hands, hand, skin):
+    """Mean of the pattern in every pixel of a window."""
+    above, below = np.empty((image.shape[1] + 1, 2)), np.empty((image.shape[1] + 1, 2))
+    quad, strip, piece, spare = np.empty((4, 2)), np.empty((8, 2)), np.empty((8, 2)), np.empty((8, 2))
+    _trace(lens, T_board_camera, 0, above)
     for row in range(image.shape[0]):
+        _trace(lens, T_board_camera, row + 1, below)
         for column in range(image.shape[1]):
-            total = 0.0
-            shift_x = row * ROW_SHIFT[0] + column * COLUMN_SHIFT[0]
-            shift_y = row * ROW_SHIFT[1] + column * COLUMN_SHIFT[1]
-            for ray in range(RAYS):
-                u = (column + (ray / RAYS + shift_x) % 1.0) / LENS_STEP
-                v = (row + (ray * RAY_STEP / RAYS + shift_y) % 1.0) / LENS_STEP
-                i, j = int(v), int(u)
-                a, b = v - i, u - j
-                x = (1 - a) * ((1 - b) * lens[i, j, 0] + b * lens[i, j + 1, 0]) + a * (
-                    (1 - b) * lens[i + 1, j, 0] + b * lens[i + 1, j + 1, 0]
-                )
-                y = (1 - a) * ((1 - b) * lens[i, j, 1] + b * lens[i, j + 1, 1]) + a * (
-                    (1 - b) * lens[i + 1, j, 1] + b * lens[i + 1, j + 1, 1]
-                )
-                depth = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2]
-                reach = -origin[2] / depth if depth != 0.0 else -1.0
-                if reach <= 0:
-                    total += image[row, column]
-                    continue
-                px = origin[0] + reach * (rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2])
-                py = origin[1] + reach * (rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2])
-                hidden = False
-                for k in range(len(hands)):
-                    if (px - hands[k, 0]) ** 2 + (py - hands[k, 1]) ** 2 < hand * hand:
-                        hidden = True
-                if hidden:
-                    total += skin
-                    continue
-                c, r = int(np.floor(px / square)), int(np.floor(py / square))
-                if c < 0 or r < 0 or c >= columns or r >= rows:
-                    outside = px < -margin or py < -margin or px > columns * square + margin
-                    if outside or py > rows * square + margin:
-                        total += image[row, column]
-                    else:
-                        total += paper
-                    continue
-                if depth < 0:  # the blank back
-                    total += paper
-                    continue
-                if squares[r, c] == BLACK:
-                    total += ink
-                    continue
-                s, t = (px - c * square - border) / marker, (py - r * square - border) / marker
-                if s < 0 or t < 0 or s >= 1 or t >= 1 or bits[squares[r, c], int(t * cells), int(s * cells)]:
-                    total += paper
-                else:
-                    total += ink
-            image[row, column] = total / RAYS
+            for axis in range(2):
+                quad[0, axis], quad[1, axis] = above[column, axis], above[column + 1, axis]
+                quad[3, axis], quad[2, axis] = below[column, axis], below[column + 1, axis]
+            if not np.isfinite(quad).all():
+                continue
+            left, right = _cells(quad, 0, x_lines)
+            top, bottom = _cells(quad, 1, y_lines)
+            grey = tones[top, left]
+            if left < right or top < bottom:
+                total = whole = 0.0
+                for i in range(left, right + 1):
+                    count = _cut(quad, 4, 0, x_lines[i], x_lines[i + 1], strip, spare)
+                    for j in range(top, bottom + 1):
+                        area = _area(piece, _cut(strip, count, 1, y_lines[j], y_lines[j + 1], piece, spare))
+                        total += area * tones[j, i]
+                        whole += area
+                grey = total / whole
+            x, y, width = (quad[0, 0] + quad[2, 0]) / 2, (quad[0, 1] + quad[2, 1]) / 2, np.sqrt(_area(quad, 4))
+            for k in range(len(hands)):
+                inside = (hand - np.hypot(x - hands[k, 0], y - hands[k, 1])) / width
+                grey += min(max(inside + 0.5, 0.0), 1.0) * (skin - grey)
+            image[row, column] = grey
+        above, below = below, above
+
+
+@no_type_check
+@njit(cache=True)
+def _trace(lens, T_board_camera, row, points):
+    """Where rays through the upper corners of a row of pixels meet the board; NaN where they do not, or far away."""
+    rotation, origin = T_board_camera[:3, :3], T_board_camera[:3, 3]
+    i = row // LENS_STEP
+    a = row / LENS_STEP - i
+    for column in range(len(points)):
+        j = column // LENS_STEP
+        b = column / LENS_STEP - j
+        p, q, r, s = (1 - a) * (1 - b), (1 - a) * b, a * (1 - b), a * b
+        x = p * lens[i, j, 0] + q * lens[i, j + 1, 0] + r * lens[i + 1, j, 0] + s * lens[i + 1, j + 1, 0]
+        y = p * lens[i, j, 1] + q * lens[i, j + 1, 1] + r * lens[i + 1, j, 1] + s * lens[i + 1, j + 1, 1]
+        depth = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2]
+        reach = -origin[2] / depth if depth != 0.0 else -1.0
+        for axis in range(2):
+            ray = rotation[axis, 0] * x + rotation[axis, 1] * y + rotation[axis, 2]
+            points[column, axis] = origin[axis] + reach * ray if 0 < reach < FAR_M / 100 else np.nan
+
+
+@no_type_check
+@njit(cache=True)
+def _cells(quad, axis, lines):
+    """First and last of the cells between lines that a quadrilateral reaches into."""
+    low = min(min(quad[0, axis], quad[1, axis]), min(quad[2, axis], quad[3, axis]))
+    high = max(max(quad[0, axis], quad[1, axis]), max(quad[2, axis], quad[3, axis]))
+    first = np.searchsorted(lines, low, side="right") - 1
+    last = first
+    while lines[last + 1] <= high:
+        last += 1
+    return first, last
+
+
+@no_type_check
+@njit(cache=True)
+def _cut(polygon, count, axis, low, high, out, spare):
+    """The part of a convex polygon between two lines (Sutherland and Hodgman); its number of corners."""
+    return _halve(spare, _halve(polygon, count, axis, low, 1.0, spare), axis, high, -1.0, out)
+
+
+@no_type_check
+@njit(cache=True)
+def _halve(polygon, count, axis, bound, sign, out):
+    kept = 0
+    for k in range(count):
+        after = k + 1 if k + 1 < count else 0
+        depth, next_depth = sign * (polygon[k, axis] - bound), sign * (polygon[after, axis] - bound)
+        if depth >= 0:
+            out[kept, 0], out[kept, 1] = polygon[k, 0], polygon[k, 1]
+            kept += 1
+        if (depth < 0 < next_depth) or (next_depth < 0 < depth):
+            share = depth / (depth - next_depth)
+            for other in range(2):
+                out[kept, other] = polygon[k, other] + share * (polygon[after, other] - polygon[k, other])
+            kept += 1
+    return kept
+
+
+@no_type_check
+@njit(cache=True)
+def _area(polygon, count):
+    doubled = 0.0
+    for k in range(1, count - 1):
+        ax, ay = polygon[k, 0] - polygon[0, 0], polygon[k, 1] - polygon[0, 1]
+        bx, by = polygon[k + 1, 0] - polygon[0, 0], polygon[k + 1, 1] - polygon[0, 1]
+        doubled += ax * by - ay * bx
+    return abs(doubled) / 2

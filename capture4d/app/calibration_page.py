@@ -129,8 +129,10 @@ def calibration_tiles(report: Mapping[str, Any]) -> list[tuple[str, str, str]]:
 
 
 def calibration_charts(report: Mapping[str, Any]) -> list[dict[str, str]]:
-    """Titles and SVGs of the curves over the poses."""
-    poses = list(range(len(report["poses"])))
+    """Titles and SVGs of the curves over the poses, by their numbers if that is what they are called."""
+    names = [row["name"] for row in report["poses"]]
+    numbered = all(name.isdecimal() for name in names)
+    poses = [int(name) for name in names] if numbered else list(range(len(names)))
     residuals = [
         Line("median", np.array([row["median_px"] for row in report["poses"]]), BLUE),
         Line("root mean square", np.array([row["rms_px"] for row in report["poses"]]), GREY),
@@ -154,6 +156,15 @@ def _summary(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     if held:
         pixels, corners = (float(np.median([row[key] for row in held])) for key in ("median_px", "corner_rms_mm"))
         rows.append(("held out", f"{len(held)} poses, {pixels:.3f} px median, corners within {corners:.3f} mm rms"))
+    measured = [row for row in report["volume"] if row["corner_rms_mm"] is not None]
+    if measured:
+        corners = float(np.median([row["corner_rms_mm"] for row in measured]))
+        worst = max(measured, key=lambda row: row["corner_rms_mm"])
+        scale = max(abs(row["scale_ppm"]) for row in measured)
+        within = (
+            f"corners triangulated within {corners:.3f} mm rms, {worst['corner_rms_mm']:.3f} at pose {worst['name']}"
+        )
+        rows.append(("volume", f"{len(measured)} poses, {within}; scale within {scale:.0f} ppm"))
     if report["flatness"]:
         flat = report["flatness"]
         bent = f"out of plane by {flat['out_of_plane_rms_mm']:.3f} mm rms, {flat['out_of_plane_max_mm']:.3f} at most"

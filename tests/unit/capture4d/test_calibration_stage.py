@@ -84,6 +84,7 @@ def test_a_rig_is_calibrated_from_images(shoot):
     assert "Rig calibration" in page
     assert "http" not in page.replace("http-equiv", ""), "self-contained"
     assert all(name in page for name in truth.names)
+    assert "corners triangulated within" in page
 
 
 def test_an_untouched_rig_passes_the_check_and_a_turned_camera_does_not(shoot, capsys: pytest.CaptureFixture[str]):

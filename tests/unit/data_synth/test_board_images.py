@@ -7,7 +7,7 @@ import pytest
 
 from capture4d.calibration_board import parse_board
 from capture4d.corner_detection import detect_corners
-from capture4d.projection import rotation_from_vector
+from capture4d.projection import rotation_from_vector, undistort
 from capture4d.types import Rig
 from data_synth.board_images import BoardImageConfig, photograph_board
 
@@ -70,3 +70,21 @@ def test_hands_hide_corners(rig: Rig):
 def test_noise_has_the_strength_asked_for(rig: Rig):
     clean, noisy = shot(rig, before_the_camera()), shot(rig, before_the_camera(), replace(CLEAN, noise=4.0))
     assert abs((noisy.astype(float) - clean).std() - 4.0) < 0.1
+
+
+def test_a_pixel_is_the_mean_of_the_pattern_in_it(rig: Rig):
+    """Against 1600 rays a pixel into the board as OpenCV prints it."""
+    pose, side, fine = before_the_camera(turn=0.6), 40, 40
+    image = shot(rig, pose)[220 : 220 + side, 300 : 300 + side]
+    along = (np.arange(side * fine) + 0.5) / fine - 0.5
+    pixels = np.stack(np.meshgrid(300 + along, 220 + along), axis=-1).reshape(-1, 2)
+    rays = np.concatenate([undistort(pixels, rig.intrinsics[0], rig.distortion[0]), np.ones((len(pixels), 1))], axis=1)
+    T_board_camera = np.linalg.inv(pose)
+    rays = rays @ T_board_camera[:3, :3].T
+    met = T_board_camera[:3, 3] - T_board_camera[2, 3] / rays[:, 2:] * rays
+    printed = BOARD.opencv().generateImage((7 * 180, 5 * 180), marginSize=0, borderBits=1)  # 3 texels a millimetre
+    column, row = np.floor(3000 * met[:, :2]).astype(int).T
+    reference = np.where(printed[row, column] > 127, CLEAN.paper, CLEAN.ink).reshape(side, fine, side, fine)
+    error = image - reference.mean(axis=(1, 3))
+    assert np.abs(error).max() < 3
+    assert abs(error.mean()) < 0.1
