@@ -121,8 +121,13 @@ class CoarseConfig:
 
     cold: Schedule = Schedule(8, (0.12, 0.05), rigid=(100.0, 3.0), smooth=(60.0, 2.0), stretch=(100.0, 10.0))
     """From a skinned template or another distant start."""
-    warm: Schedule = Schedule(2, (0.05, 0.03), rigid=(50.0, 50.0), smooth=(60.0, 60.0), stretch=(10.0, 10.0))
+    warm: Schedule = Schedule(2, (0.05, 0.03), rigid=(25.0, 25.0), smooth=(30.0, 30.0), stretch=(40.0, 40.0))
     """From the frame before."""
+    start_lengths: bool = True
+    """In the warm schedule, hold nodes to their distances in the start, not in the template: folds have shortened
+    them, and where cloth bunches the template's distances push it off its place."""
+    compression: float = 0.3
+    """Share of the stretch weight that resists shortening, in the warm schedule."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +136,7 @@ class DenseConfig:
 
     cold: Schedule = Schedule(10, (0.03, 0.012), smooth=(0.05, 0.02), stretch=(10.0, 0.05), boundary=(0.3, 0.1))
     """After a cold coarse stage."""
-    warm: Schedule = Schedule(3, (0.02, 0.012), smooth=(0.03, 0.02), stretch=(10.0, 0.05), boundary=(0.2, 0.1))
+    warm: Schedule = Schedule(3, (0.02, 0.012), smooth=(0.06, 0.05), stretch=(10.0, 0.05), boundary=(0.2, 0.1))
     """After a warm coarse stage."""
     plasticity: float = 0.5
     """Share of the bending that is forgiven between steps: 0 keeps the coarse stage's shape, 1 only damps change."""
@@ -153,7 +158,7 @@ class SequenceConfig:
     """A keyframe's joints are at most this far from the rest pose, root mean square, degrees; 0 makes one segment."""
     start: Literal["best", "previous", "skinned"] = "best"
     """Start of a frame: the frame before, the skinned pose, or whichever is nearer to the scan."""
-    carry: float = 0.9
+    carry: float = 0.7
     """Share of the offsets from the skinned pose that a frame hands to the next, in the rest pose."""
     cold_above: float = 0.004
     """Take the cold schedule when the median distance from start to scan exceeds this, metres."""

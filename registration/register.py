@@ -87,7 +87,7 @@ def register_frame(
         )
     coarse = config.coarse.cold if schedule == "cold" else config.coarse.warm
     dense = config.dense.cold if schedule == "cold" else config.dense.warm
-    vertices, first = _coarse_stage(analysis, scan, start, coarse, config)
+    vertices, first = _coarse_stage(analysis, scan, start, coarse, config, near=schedule == "warm")
     vertices, second = _dense_stage(analysis, scan, start, vertices, dense, config, near=schedule == "warm")
     return FrameRegistration(vertices, schedule, first + second)
 
@@ -102,7 +102,13 @@ def anneal(pair: tuple[float, float], step: int, steps: int) -> float:
 
 
 def _coarse_stage(
-    analysis: TemplateAnalysis, scan: FrameScan, start: np.ndarray, schedule: Schedule, config: RegistrationConfig
+    analysis: TemplateAnalysis,
+    scan: FrameScan,
+    start: np.ndarray,
+    schedule: Schedule,
+    config: RegistrationConfig,
+    *,
+    near: bool,
 ) -> tuple[np.ndarray, int]:
     if schedule.steps == 0:
         return start, 0
@@ -116,7 +122,9 @@ def _coarse_stage(
     node_rows, node_constant = smooth_rows(graph, start)
     pair_rows, pairs = node_edge_rows(graph)
     pair_start = edge_vectors(start[graph.nodes], pairs)
-    pair_rest = np.linalg.norm(edge_vectors(analysis.rest[graph.nodes], pairs), axis=1)
+    measured = start if near and config.coarse.start_lengths else analysis.rest
+    pair_lengths = np.linalg.norm(edge_vectors(measured[graph.nodes], pairs), axis=1)
+    compression = config.coarse.compression if near else config.dense.compression
     iterations = 0
     vertices = start
     for step in range(schedule.steps):
@@ -137,7 +145,7 @@ def _coarse_stage(
         stretch = anneal(schedule.stretch, *at)
         if stretch > 0.0:
             metric, excess = stretch_metric(
-                pair_start + pair_rows.apply(nodes), pair_rest, weight=stretch, compression=config.dense.compression
+                pair_start + pair_rows.apply(nodes), pair_lengths, weight=stretch, compression=compression
             )
             terms.append(RowTerm(pair_rows, metric, excess))
         rigid = rigid_term(nodes, weight=anneal(schedule.rigid, *at), spacing=graph.spacing)
