@@ -5,7 +5,6 @@ docs/report.md defines every metric. Those against truth appear where the captur
 
 from __future__ import annotations
 
-import json
 import math
 import platform
 from collections.abc import Mapping, Sequence
@@ -23,12 +22,11 @@ from capture4d.app.charts import Line, line_chart
 from capture4d.app.report_metrics import METRICS, VERDICTS, column, summarise, truth_measures
 from capture4d.app.report_pictures import Framing, Panel, colour_bar, draw_frame
 from capture4d.app.report_stages import Calibration, StagePictures, Tracking, calibration, draw_stages, tracking
-from capture4d.errors import InputError
 from capture4d.evaluation import correspondence_errors, material_points
 from capture4d.scans import Capture, TruthModel, read_capture, read_scan, read_truth_model, read_truth_vertices
 from capture4d.types import RegisteredSequence
+from capture4d.work_folder import capture_path, load_records, load_registration
 from capture4d.workdir import open_stage, read_json, require_complete, run_jobs, write_bytes, write_json
-from registration.stage import load_registration
 
 __all__ = ["ReportConfig", "run"]
 
@@ -104,7 +102,7 @@ def run(
         InputError: the registration is unfinished, or the capture is not where it was.
     """
     folder = work / "report"
-    place = _capture_path(work) if capture is None else capture
+    place = capture_path(work) if capture is None else capture
     digest = require_complete(work / "registration", "register", f"capture4d register {place} --output {work}")
     current = {"schema": SCHEMA, "config": asdict(config), "upstream": {"registration": digest}}
     if not overwrite and _is_current(folder, current):
@@ -114,7 +112,7 @@ def run(
     stage = open_stage(
         folder, name="report", schema=SCHEMA, config=config, upstream=current["upstream"], overwrite=stale
     )
-    records = [json.loads(line) for line in (work / "registration" / "metrics.jsonl").read_text().splitlines()]
+    records = load_records(work / "registration")
     _measure_truth(work, description, records, config, workers)
     tracked = tracking(description, work)
     summary = summarise(records)
@@ -369,16 +367,6 @@ def _run_rows(work: Path, capture: Capture, records: Sequence[Mapping[str, Any]]
 
 
 # --- small things ------------------------------------------------------------------------------------------------
-
-
-def _capture_path(work: Path) -> Path:
-    """Where the capture lies: as the first stage recorded it, or else inside the work folder."""
-    record = work / "garment" / "stage.json"
-    recorded = read_json(record).get("sources", {}).get("capture") if record.is_file() else None
-    for candidate in (recorded, work / "capture"):
-        if candidate is not None and (Path(candidate) / "capture.json").is_file():
-            return Path(candidate)
-    raise InputError(f"{work}: expected the capture at {recorded or work / 'capture'}, found none there")
 
 
 def _is_current(folder: Path, current: Mapping[str, Any]) -> bool:
