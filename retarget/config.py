@@ -100,8 +100,8 @@ class TrainingConfig:
     """Largest norm of a gradient."""
     patience: int = 40
     """Epochs without improvement on the validation clips after which to stop."""
-    checkpoint_steps: int = 200
-    """Steps between checkpoints within an epoch; every epoch ends with one."""
+    checkpoint_s: float = 30.0
+    """Seconds between checkpoints; they change nothing in the result."""
     threads: int = 1
     """Threads of torch; results are the same bits only for the same number."""
     seed: int = 0
