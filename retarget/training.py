@@ -104,7 +104,7 @@ def train_lstm(
                 loss.backward()
                 torch.nn.utils.clip_grad_norm_(network.parameters(), config.clip_gradient, foreach=False)
                 optimiser.step()
-                progress.loss_sum += float(loss)
+                progress.loss_sum += float(loss.detach())
                 progress.step += 1
                 if time.monotonic() - saved >= config.checkpoint_s:
                     _save(checkpoint, network, optimiser, best, progress)
@@ -240,4 +240,4 @@ def _resume(
 
 
 def _write_metrics(path: Path, records: Sequence[dict[str, Any]]) -> None:
-    write_bytes(path, "".join(json.dumps(record) + "\n" for record in records).encode())
+    write_bytes(path, "".join(json.dumps(record, sort_keys=True) + "\n" for record in records).encode())

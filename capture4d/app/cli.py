@@ -26,6 +26,7 @@ from data_synth import config as synth_config
 from data_synth.scanner_config import ScanConfig
 from registration import config as registration_config
 from registration.config import MeshRegistrationConfig, RegistrationConfig
+from retarget.config import AnimateConfig, FitConfig
 
 # What a user's disk can answer; the message names the path, and a traceback would add nothing.
 _DISK_ANSWERS = {
@@ -79,17 +80,28 @@ class Synth(_Stage):
 
     output: Annotated[Positional[Path], arg(metavar="OUTPUT")]
     """Capture folder to write."""
-    preset: Literal[*synth_config.PRESETS] = "demo"
-    """What the settings below start from."""
+    preset: Literal[*synth_config.PRESETS, *synth_config.TRAINING_SETS] = "demo"
+    """What the settings below start from; a training set is many takes, and has no other settings."""
     scanner: Literal["depth", "stereo"] | None = None
     """Short for --scanner.sensor."""
     config: Annotated[synth_config.SynthConfig, arg(name="")] = field(default_factory=synth_config.SynthConfig)
 
     def __call__(self) -> int:
+        if self.preset in synth_config.TRAINING_SETS:
+            return self._training_set()
         from data_synth.stage import run
 
         run(self.output, _with_sensor(self.config, self.scanner), workers=self.workers, overwrite=self.overwrite)
         print(f"capture: {self.output}")
+        return 0
+
+    def _training_set(self) -> int:
+        from data_synth.training_set import run
+
+        if self.config != synth_config.SynthConfig() or self.scanner is not None:
+            raise InputError(f"--preset {self.preset}: expected no other settings, for its takes bring their own")
+        run(self.output, synth_config.TRAINING_SETS[self.preset], workers=self.workers, overwrite=self.overwrite)
+        print(f"captures: {self.output / 'takes'}")
         return 0
 
 
@@ -357,7 +369,7 @@ class Run(_Stage):
 
 @dataclass(frozen=True, kw_only=True)
 class Report(_Stage):
-    """Draw the report of a registered capture, and check its metrics against limits."""
+    """Draw the report of a registered capture or an animated garment, and check its metrics against limits."""
 
     work: Annotated[Positional[Path], arg(metavar="WORK")]
     """Work folder; holds registration/ and gets report/."""
@@ -376,6 +388,67 @@ class Report(_Stage):
         for line in broken:
             print(f"capture4d: {line}", file=sys.stderr)
         return 1 if broken else 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fit(_Stage):
+    """Learn the garment from registered takes: its blendshapes, and the regressors that drive them with poses."""
+
+    works: Annotated[Positional[tuple[Path, ...]], arg(metavar="WORK")]
+    """Work folders of registered takes of one template and one person."""
+    output: Path | None = None
+    """Work folder that gets retarget/; the take's own if there is one take."""
+    device: str = "cpu"
+    """Where torch trains, such as cpu or cuda."""
+    config: Annotated[FitConfig, arg(name="")] = field(default_factory=FitConfig)
+
+    def __call__(self) -> int:
+        from retarget.stage import run
+
+        if not self.works:
+            raise InputError("WORK: expected at least one work folder, found none")
+        if self.output is None and len(self.works) > 1:
+            raise InputError(f"--output: expected a work folder for what {len(self.works)} takes give, found none")
+        folder = (self.output or self.works[0]) / "retarget"
+        run(self.works, folder, self.config, device=self.device, workers=self.workers, overwrite=self.overwrite)
+        print(f"model: {folder}")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Animate(_Stage):
+    """Put a learned garment on a motion, and on another body: a sequence like a registered one."""
+
+    model: Annotated[Positional[Path], arg(metavar="MODEL")]
+    """What `fit` wrote: WORK, WORK/retarget, or the blendshapes.safetensors in it."""
+    poses: Path
+    """Motion file, .npz or .bvh."""
+    output: Path
+    """Work folder; gets body/ and registration/."""
+    body: Path | None = None
+    """Another person, a body.npz of the same faces and joints."""
+    beta: tuple[float, ...] | None = None
+    """Shape of the person, in standard deviations; the captured person without --body and --beta."""
+    device: str = "cpu"
+    """Where torch computes, such as cpu or cuda."""
+    config: Annotated[AnimateConfig, arg(name="")] = field(default_factory=AnimateConfig)
+
+    def __call__(self) -> int:
+        from retarget.animate_stage import run
+
+        run(
+            self.model,
+            self.poses,
+            self.output,
+            self.config,
+            body=self.body,
+            beta=self.beta,
+            device=self.device,
+            workers=self.workers,
+            overwrite=self.overwrite,
+        )
+        print(f"registration: {self.output / 'registration'}")
+        return 0
 
 
 @dataclass(frozen=True)
@@ -519,6 +592,8 @@ _COMMANDS: Mapping[str, Any] = {
     "register": Register,
     "run": Run,
     "report": Report,
+    "fit": Fit,
+    "animate": Animate,
     "register-mesh": RegisterMesh,
     "calibrate": Calibrate,
     "check-rig": CheckRig,
@@ -617,7 +692,7 @@ def _overview() -> str:
         [
             "usage: capture4d COMMAND ...",
             "",
-            "4D garment capture: non-rigid registration of coloured scans, and a synthetic 4D scanner.",
+            "4D garment capture: registration of coloured scans, learned garments, and a synthetic 4D scanner.",
             "",
             *lines,
             "",

@@ -69,6 +69,12 @@ def needs_tracking(capture: Path) -> bool:
 
 def run_report(work: Path, *, capture: Path | None = None, workers: int = 1, overwrite: bool = False) -> Path:
     """Draw the report of a work folder; the path of its page."""
+    from capture4d.work_folder import is_animated
+
+    if is_animated(work):
+        from capture4d.app.animation_report import run as report_animation
+
+        return report_animation(work, workers=workers, overwrite=overwrite)
     from capture4d.app.report import run as report
 
     return report(work, capture=capture, workers=workers, overwrite=overwrite)

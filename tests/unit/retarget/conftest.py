@@ -1,14 +1,20 @@
 """A tube of cloth around a bending bone, whose unposed shape is a known mix of a few waves."""
 
+import json
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from capture4d.body import pose_frame, skin, with_shape
+from capture4d.evaluation import closest_points
 from capture4d.mesh import boundary_loops
+from capture4d.records import save_body, save_garment, save_poses
 from capture4d.types import Body, Garment, Mesh, PoseSequence, RegisteredSequence
+from capture4d.work_folder import REGISTER, VERDICTS, stack_vertices
+from capture4d.workdir import open_stage, write_bytes, write_npz
 
 NAMES = ("root", "middle", "top")
 
@@ -52,8 +58,6 @@ def body() -> Body:
 def garment(body: Body) -> Garment:
     mesh = tube(20, 14, 0.13)
     low, high = sorted(boundary_loops(mesh.faces), key=lambda loop: mesh.vertices[loop, 1].mean())
-    from capture4d.evaluation import closest_points
-
     _, faces, barycentric = closest_points(body.template, mesh.vertices)
     return Garment(
         mesh, {"hem": low, "neck": high}, faces, barycentric, bone_weights(mesh.vertices[:, 1]), np.zeros(2, np.float32)
@@ -121,3 +125,32 @@ def make_world(body: Body, garment: Garment):
         return World(body, garment, directions, 0.05 * rng.standard_normal((6, waves)), lag)
 
     return make
+
+
+@pytest.fixture
+def write_work(tmp_path: Path, make_world):
+    """A work folder with a finished registration of the world's garment, its body tracked."""
+
+    def write(name: str, poses: PoseSequence, *, world: World | None = None, flagged: tuple[int, ...] = ()) -> Path:
+        work, world = tmp_path / name, world or make_world()
+        registered = world.registered(poses)
+        stage = open_stage(
+            work / "registration", name=REGISTER, schema=1, config={}, upstream={"body": "x", "garment": name}
+        )
+        save_garment(stage.path / "garment.npz", registered.garment)
+        records = []
+        for row, frame_id in enumerate(poses.frame_ids.tolist()):
+            verdict = 2 if row in flagged else 0
+            vertices = registered.vertices[row] + (5.0 if row in flagged else 0.0)
+            residual = registered.residual_m[row]
+            write_npz(stage.frame_path(frame_id), vertices=vertices, residual_m=residual, verdict=np.uint8(verdict))
+            records.append({"frame_id": frame_id, "verdict": VERDICTS[verdict], "reasons": []})
+        stack_vertices(stage, poses.frame_ids.tolist())
+        lines = "".join(json.dumps(record) + "\n" for record in records)
+        write_bytes(stage.path / "metrics.jsonl", lines.encode())
+        stage.finish([stage.path / "vertices.npy"])
+        save_body(work / "body" / "body.npz", world.body)
+        save_poses(work / "body" / "poses.npz", poses)
+        return work
+
+    return write
