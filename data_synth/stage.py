@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from capture4d.body import PosedBody, ShapedBody, pose_frame, with_shape
 from capture4d.body_anny import load_anny
+from capture4d.motion_retarget import pose_sequence
 from capture4d.records import load_rig, save_body, save_garment, save_poses, save_rig
 from capture4d.scans import (
     Capture,
@@ -93,9 +94,14 @@ def prepare_take(config: SynthConfig) -> Take:
     }
     if config.motion.seed:
         streams["motion"] = np.random.default_rng([config.seed, 0, config.motion.seed])
-    shaped = with_shape(load_anny(), np.array(config.body_shape, np.float32))
+    shaped = _person(config.body_shape)
     simulated = (config.frames - 1) * config.capture_every + 1
-    motion = make_motion(shaped, config.motion, config.simulation.fps, simulated, streams["motion"])
+    drafted = shaped if config.drafted_for is None else _person(config.drafted_for)
+    motion = make_motion(drafted, config.motion, config.simulation.fps, simulated, streams["motion"])
+    if config.drafted_for is not None:  # who wears the graded garment moves as who wore the first
+        motion = pose_sequence(
+            shaped, motion.rotations.astype(np.float64), motion.fps, motion.translations.astype(np.float64)
+        )
     kept = slice(None, None, config.capture_every)
     poses = PoseSequence(
         motion.rotations[kept],
@@ -112,13 +118,10 @@ def prepare_take(config: SynthConfig) -> Take:
         "fine": config.relaxation.vertices,
         "template": config.template_vertices,
     }
-    if config.drafted_for is None:
-        meshes = {name: mesh_pattern(pattern, count, streams[name]) for name, count in counts.items()}
-    else:
-        drafted = tshirt_pattern(with_shape(load_anny(), np.array(config.drafted_for, np.float32)), config.style)
-        meshes = {
-            name: grade(mesh_pattern(drafted, count, streams[name]), drafted, pattern) for name, count in counts.items()
-        }
+    first = tshirt_pattern(drafted, config.style)
+    meshes = {name: mesh_pattern(first, count, streams[name]) for name, count in counts.items()}
+    if config.drafted_for is not None:
+        meshes = {name: grade(mesh, first, pattern) for name, mesh in meshes.items()}
     return Take(
         config=config,
         shaped=shaped,
@@ -130,6 +133,10 @@ def prepare_take(config: SynthConfig) -> Take:
         template=meshes["template"],
         wrinkles=wrinkle_mesh(meshes["coarse"], meshes["fine"], config.relaxation, streams["imperfection"]),
     )
+
+
+def _person(shape: tuple[float, ...]) -> ShapedBody:
+    return with_shape(load_anny(), np.array(shape, np.float32))
 
 
 def run(output: Path, config: SynthConfig, *, workers: int = 2, overwrite: bool = False) -> str:

@@ -8,16 +8,18 @@ References: DeepWrinkles (ECCV 2018), section 3.2: R_bar = S^-1(R, theta).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64
 
-from capture4d.body import ShapedBody, pose_frame, unskin
+from capture4d.body import ShapedBody, pose_frame, unskin, with_shape
 from capture4d.errors import InputError
+from capture4d.garment_binding import embedded_offset
 from capture4d.types import PoseSequence, RegisteredSequence
 
-__all__ = ["PoseRows", "unpose_frame"]
+__all__ = ["PoseRows", "unpose_frame", "unpose_sequence"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,3 +81,28 @@ def unpose_frame(
     rest, singular = unskin(vertices.astype(np.float64), skin_weights, transforms)
     weights = np.where(seen, 1.0, unseen_weight) * ~singular
     return rest.astype(np.float32), weights.astype(np.float32)
+
+
+def unpose_sequence(
+    registered: RegisteredSequence, rows: PoseRows, person: Float[np.ndarray, " shapes"], *, unseen_weight: float
+) -> Iterator[tuple[Float32[np.ndarray, "verts 3"], Float32[np.ndarray, " verts"]]]:
+    """The frames of a take in the rest pose, with weights, on the person whom all takes share.
+
+    Args:
+        person: shape coefficients. Takes are tracked one by one, and their shapes differ a little.
+    """
+    garment = registered.garment
+    assert garment.skin_weights is not None
+    offset = np.zeros(3)
+    if garment.embedding_faces is not None:
+        body = rows.shaped.body
+        offset = embedded_offset(garment, body, with_shape(body, person).vertices - rows.shaped.vertices)
+    for row in range(len(registered.frame_ids)):
+        rest, weights = unpose_frame(
+            np.asarray(registered.vertices[row]),
+            np.isfinite(registered.residual_m[row]),
+            garment.skin_weights,
+            rows.transforms(row),
+            unseen_weight=unseen_weight,
+        )
+        yield (rest + offset).astype(np.float32), weights

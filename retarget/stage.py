@@ -25,7 +25,7 @@ import numpy as np
 from capture4d.blendshape_files import load_blendshapes, save_blendshapes
 from capture4d.body import with_shape
 from capture4d.errors import InputError
-from capture4d.garment_binding import embedded_offset, with_body_shape
+from capture4d.garment_binding import with_body_shape
 from capture4d.records import load_body, load_garment, save_body
 from capture4d.types import BlendshapeModel, Body, PoseSequence
 from capture4d.work_folder import load_moving_body, load_records, load_registration
@@ -53,7 +53,7 @@ from retarget.learning import (
     vertex_error_m,
 )
 from retarget.linear import LinearRegressor, fit_linear, load_linear, mean_squared_error, save_linear
-from retarget.pose_normalisation import PoseRows, unpose_frame
+from retarget.pose_normalisation import PoseRows, unpose_sequence
 from retarget.pose_range import PoseRange, load_pose_range, save_pose_range
 from retarget.regressors import Regressor
 from retarget.splits import Piece, split_takes
@@ -165,24 +165,12 @@ def _unpose_take(output: Path, unseen_weight: float, person: np.ndarray, job: _U
     registered = load_registration(job.work / "registration")
     body, poses = load_moving_body(job.work)
     rows = PoseRows.match(registered, with_shape(body, poses.shape), poses)
-    garment = registered.garment
-    assert garment.skin_weights is not None
-    offset = 0.0
-    if garment.embedding_faces is not None:
-        offset = embedded_offset(garment, body, with_shape(body, person).vertices - rows.shaped.vertices)
     weights = []
 
     def frames() -> Iterator[np.ndarray]:
-        for row in range(len(registered.frame_ids)):
-            rest, weight = unpose_frame(
-                np.asarray(registered.vertices[row]),
-                np.isfinite(registered.residual_m[row]),
-                garment.skin_weights,
-                rows.transforms(row),
-                unseen_weight=unseen_weight,
-            )
+        for rest, weight in unpose_sequence(registered, rows, person, unseen_weight=unseen_weight):
             weights.append(weight)
-            yield (rest + offset).astype(np.float32)
+            yield rest
 
     folder = output / "unposed"
     write_npy_rows(folder / f"{job.name}.vertices.npy", frames(), count=len(registered.frame_ids))

@@ -10,7 +10,7 @@ from capture4d.errors import InputError
 from capture4d.workdir import read_json
 from registration.config import RegistrationConfig
 
-__all__ = ["broken_limits", "needs_tracking", "parse_limits", "run_all", "run_demo", "run_report"]
+__all__ = ["broken_limits", "needs_tracking", "parse_limits", "run_all", "run_demo", "run_report", "run_stages"]
 
 
 def run_demo(output: Path, *, workers: int, overwrite: bool = False) -> Path:
@@ -37,6 +37,21 @@ def run_all(
     Args:
         track: track the body even if the capture brings poses.
     """
+    run_stages(capture, output, config, tracking=tracking, track=track, workers=workers, overwrite=overwrite)
+    return run_report(output, capture=capture, workers=workers, overwrite=overwrite)
+
+
+def run_stages(
+    capture: Path,
+    output: Path,
+    config: RegistrationConfig,
+    *,
+    tracking: TrackingConfig | None = None,
+    track: bool = False,
+    workers: int,
+    overwrite: bool = False,
+) -> None:
+    """The same without the report."""
     from capture4d.garment_stage import run as extract
     from registration.stage import run as register
 
@@ -56,7 +71,6 @@ def run_all(
         workers=workers,
         overwrite=overwrite,
     )
-    return run_report(output, capture=capture, workers=workers, overwrite=overwrite)
 
 
 def needs_tracking(capture: Path) -> bool:
