@@ -37,7 +37,7 @@ def bone_weights(height: np.ndarray) -> np.ndarray:
     return np.stack([1 - middle, middle - top, top], axis=1).astype(np.float32)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def body() -> Body:
     """A limb, 0.1 m in radius; its first shape component makes it 2 cm thicker, its second a tenth longer."""
     mesh = tube(24, 16, 0.1, 0.7, -0.1)
@@ -54,7 +54,7 @@ def body() -> Body:
     )
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def garment(body: Body) -> Garment:
     mesh = tube(20, 14, 0.13)
     low, high = sorted(boundary_loops(mesh.faces), key=lambda loop: mesh.vertices[loop, 1].mean())
@@ -111,12 +111,12 @@ class World:
         return RegisteredSequence(self.garment, np.array(vertices, np.float32), residual, poses.frame_ids)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def motion():
     return some_motion
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_world(body: Body, garment: Garment):
     def make(lag: float = 0.0, waves: int = 4) -> World:
         rng = np.random.default_rng(5)
@@ -127,15 +127,15 @@ def make_world(body: Body, garment: Garment):
     return make
 
 
-@pytest.fixture
-def write_work(tmp_path: Path, make_world):
+@pytest.fixture(scope="session")
+def write_work(make_world):
     """A work folder with a finished registration of the world's garment, its body tracked."""
 
-    def write(name: str, poses: PoseSequence, *, world: World | None = None, flagged: tuple[int, ...] = ()) -> Path:
-        work, world = tmp_path / name, world or make_world()
+    def write(work: Path, poses: PoseSequence, *, world: World | None = None, flagged: tuple[int, ...] = ()) -> Path:
+        world = world or make_world()
         registered = world.registered(poses)
         stage = open_stage(
-            work / "registration", name=REGISTER, schema=1, config={}, upstream={"body": "x", "garment": name}
+            work / "registration", name=REGISTER, schema=1, config={}, upstream={"body": "x", "garment": work.name}
         )
         save_garment(stage.path / "garment.npz", registered.garment)
         records = []

@@ -1,6 +1,7 @@
 """Fit and animate from the command line: what comes out, resuming, and what is wrong in one line."""
 
 import pickle
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +19,18 @@ from capture4d.workdir import read_json
 from retarget.config import SplitConfig
 from retarget.splits import split_takes
 
-QUICK = ("--lstm.layers", "1", "--lstm.size", "16", "--training.epochs", "3", "--workers", "1")
+QUICK = (
+    "--shape.max-error-mm",
+    "0.1",
+    "--lstm.layers",
+    "1",
+    "--lstm.size",
+    "16",
+    "--training.epochs",
+    "3",
+    "--workers",
+    "1",
+)
 
 
 def run(*arguments: str | Path) -> int:
@@ -37,17 +49,24 @@ def fails(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
     return said.splitlines()[-1]
 
 
-@pytest.fixture
-def works(write_work, motion, make_world) -> list[Path]:
-    world = make_world(waves=3)
-    return [write_work(f"take{seed}", motion(30, seed), world=world, flagged=(4,)) for seed in range(3)]
+@pytest.fixture(scope="module")
+def works(write_work, motion, make_world, tmp_path_factory) -> list[Path]:
+    world, folder = make_world(waves=3), tmp_path_factory.mktemp("works")
+    return [write_work(folder / f"take{seed}", motion(16, seed), world=world, flagged=(4,)) for seed in range(3)]
 
 
-@pytest.fixture
-def model(works, tmp_path: Path) -> Path:
-    output = tmp_path / "learned"
+@pytest.fixture(scope="module")
+def learned(works, tmp_path_factory) -> Path:
+    output = tmp_path_factory.mktemp("fit") / "learned"
     assert run("fit", *works, "--output", output, "--split.validation", "take2", "--licence", "CC0", *QUICK) == 0
-    return output / "retarget"
+    return output
+
+
+@pytest.fixture
+def model(learned: Path, tmp_path: Path) -> Path:
+    """A copy, to be spoilt."""
+    shutil.copytree(learned, tmp_path / "learned")
+    return tmp_path / "learned" / "retarget"
 
 
 def animate(model: Path, poses: Path, output: Path, *more: str | Path) -> tuple[str | Path, ...]:
@@ -57,18 +76,19 @@ def animate(model: Path, poses: Path, output: Path, *more: str | Path) -> tuple[
 def test_fit_finds_the_waves_and_says_so(model: Path, works, make_world) -> None:
     note, learned = read_json(model / "fit.json"), load_blendshapes(model / "blendshapes.safetensors")
     assert note["split"] == {
-        "training": ["take0[0:30]", "take1[0:30]"], "validation": ["take2[0:30]"], "held out": []
+        "training": ["take0[0:16]", "take1[0:16]"], "validation": ["take2[0:16]"], "held out": []
     }  # fmt: skip
-    assert note["training_frames"] == 58  # one of each take is flagged, and 5 m away
-    assert note["directions_for_max_error"] <= 3
-    assert note["validation_shape_error_mm"]["worst"] < 5.0
+    assert note["training_frames"] == 30  # one of each take is flagged, and 5 m away
+    assert note["directions"] == note["directions_for_max_error"] == 3
+    assert note["validation_shape_error_mm"]["worst"] < 0.5
     assert learned.licence == "CC0"
     assert list(learned.garment.loops) == ["hem", "neck"]
     assert learned.garment.template.uv is not None
     waves = make_world(waves=3).waves.reshape(3, -1)
     for direction in learned.basis.reshape(len(learned.basis), -1):
         assert np.linalg.norm(waves @ direction) > 0.999
-    assert note["linear"]["validation"]["vertex_error_mm"] < 5.0
+    assert note["linear"]["training"]["vertex_error_mm"] < 2.0
+    assert note["lstm"]["validation"]["vertex_error_mm"] > 0
     assert (model / "metrics.jsonl").read_text().count("\n") == 3
     assert not (model / "unposed").exists()
 
@@ -88,12 +108,12 @@ def test_the_captured_motion_on_the_captured_person_is_the_capture(model: Path, 
     poses = works[0] / "body" / "poses.npz"
     assert run(*animate(model, poses, output, "--regressor", "linear", "--no-removal.enabled")) == 0
     found, wanted = (load_registration(each / "registration") for each in (output, works[0]))
-    good = np.delete(np.arange(30), 4)
+    good = np.delete(np.arange(16), 4)
     apart = np.linalg.norm(found.vertices[good] - wanted.vertices[good], axis=-1)
     assert apart.mean() < 0.004
     assert np.isnan(found.residual_m).all()
     body, motion = load_moving_body(output)
-    assert len(motion.frame_ids) == 30
+    assert len(motion.frame_ids) == 16
     assert body.joint_names == motion.joint_names
 
 
@@ -127,7 +147,7 @@ def test_an_interrupted_animation_is_finished_by_the_same_command(model: Path, w
     poses, output = works[1] / "body" / "poses.npz", tmp_path / "out"
     assert run(*animate(model, poses, output)) == 0
     digest = read_json(output / "registration" / "stage.json")["digest"]
-    for path in sorted((output / "registration" / "frames").glob("*.npz"))[5:12]:
+    for path in sorted((output / "registration" / "frames").glob("*.npz"))[5:9]:
         path.unlink()
     (output / "registration" / "coefficients.npy").unlink()
     assert run(*animate(model, poses, output)) == 0
@@ -163,11 +183,11 @@ def test_takes_that_do_not_fit_together_are_one_line(works, write_work, motion, 
     world = make_world()
     faces = world.garment.template.faces[:-1].copy()
     template = replace(world.garment.template, faces=faces, uv=None)
-    other = write_work("other", motion(10, 7))
+    other = write_work(tmp_path / "other", motion(10, 7))
     save_garment(other / "registration" / "garment.npz", replace(world.garment, template=template))
     line = fails(capsys, "fit", *works, other, "--output", tmp_path / "x", *QUICK)
     assert "other: expected the template of" in line
-    slow = write_work("slow", replace(motion(10, 7), fps=30.0))
+    slow = write_work(tmp_path / "slow", replace(motion(10, 7), fps=30.0))
     assert "expected 60 frames a second" in fails(capsys, "fit", *works, slow, "--output", tmp_path / "y", *QUICK)
     assert "--output: expected" in fails(capsys, "fit", *works)
     assert "found take0, take0" in fails(capsys, "fit", works[0], works[0], "--output", tmp_path / "z")
@@ -176,8 +196,8 @@ def test_takes_that_do_not_fit_together_are_one_line(works, write_work, motion, 
     assert "found 'take9'" in line
 
 
-def test_a_take_with_one_frame_is_one_line(write_work, motion, capsys) -> None:
-    single = write_work("single", motion(1, 0))
+def test_a_take_with_one_frame_is_one_line(write_work, motion, tmp_path, capsys) -> None:
+    single = write_work(tmp_path / "single", motion(1, 0))
     assert "at least 2 good frames to learn from, found 1 of 1" in fails(capsys, "fit", single, *QUICK)
 
 
