@@ -227,8 +227,8 @@ class TrainingSetConfig:
 
 
 OTHER_BODIES: dict[str, tuple[float, ...]] = {
-    "thin": (0.0, -1.5),
-    "heavy": (0.0, 1.5),
+    "thin": (0.0, -2.0),
+    "heavy": (0.0, 2.0),
     "tall": (1.5, 0.0),
     "short": (-1.5, 0.0),
 }

@@ -55,7 +55,7 @@ class _Stage:
 
 @dataclass(frozen=True, kw_only=True)
 class Demo(_Stage):
-    """Make a synthetic capture, register it, and report: the whole pipeline in minutes."""
+    """Make a synthetic capture, register it, learn the garment, put it on another body: the pipeline in minutes."""
 
     output: Path = Path("out")
     """Folder for everything, the capture included."""
@@ -63,7 +63,9 @@ class Demo(_Stage):
     def __call__(self) -> int:
         from capture4d.app.pipeline import run_demo
 
-        print(f"report: {run_demo(self.output, workers=self.workers, overwrite=self.overwrite)}")
+        report, other = run_demo(self.output, workers=self.workers, overwrite=self.overwrite)
+        print(f"report: {report}")
+        print(f"on another body: {other}")
         return 0
 
 
