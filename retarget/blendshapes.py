@@ -3,7 +3,7 @@
 Letters: N frames, V vertices, K directions, J joints. The unposed space is the captured person's rest pose, metres.
 
 Unseen vertices are missing data, not data: the model is learned with them filled in from itself, again and again
-(weighted low-rank approximation), and a frame with gaps is projected by weighted least squares.
+(weighted low-rank approximation), and a frame is projected with its gaps filled in, by weighted least squares.
 
 References: DeepWrinkles (ECCV 2018), section 3.2, Eq. 3. As printed it projects the frame itself, lambda = V^T R_bar;
 here it is the offset, lambda = V^T (R_bar - M_bar), and the directions are those of length 3 V. Srebro and Jaakkola,
@@ -39,6 +39,9 @@ __all__ = [
 
 PRIOR_NOISE_M = 0.002
 """How exact a seen vertex is, against which the coefficients' own spread is weighed where vertices are missing."""
+FILLING_DIRECTIONS = 50
+"""Unseen vertices are filled in from so many directions. The later ones are small, and with as many directions as there
+are frames the model would fill in whatever registration had guessed."""
 FILLED = 1e-4
 """Rounds of filling end when the unseen vertices move less than this, metres, root mean square."""
 SEEN = 0.5
@@ -134,12 +137,7 @@ class _Frames:
         """Offsets from the mean, (B, V, 3): seen vertices as they are, the others as the space has them."""
         vertices, weights = self.read(block)
         offsets = vertices - space.mean
-        gaps = np.flatnonzero((weights < 1).any(axis=1))
-        if len(gaps) and len(space.basis):
-            guessed = np.tensordot(_coefficients(space, offsets[gaps], weights[gaps]), space.basis, axes=1)
-            share = weights[gaps][..., None]
-            offsets[gaps] = share * offsets[gaps] + (1 - share) * guessed
-        return offsets
+        return _filled(space, offsets, weights)
 
     def change(self, before: ShapeSpace, after: ShapeSpace) -> float:
         """How far what was filled in has moved, root mean square, metres."""
@@ -177,26 +175,47 @@ def _directions(
     return ShapeSpace(space.mean, basis.reshape(-1, columns // 3, 3), values / np.sqrt(count))
 
 
-def _coefficients(
+def _filled(
+    space: ShapeSpace, offsets: Float[np.ndarray, "frames verts 3"], weights: Float[np.ndarray, "frames verts"]
+) -> Float[np.ndarray, "frames verts 3"]:
+    """Offsets with what was not seen filled in from the first directions, as far as it was not seen."""
+    gaps = np.flatnonzero((weights < 1).any(axis=1))
+    if not len(gaps) or not len(space.basis):
+        return offsets
+    first, share, result = space.first(FILLING_DIRECTIONS), weights[gaps][..., None], offsets.copy()
+    flat = first.basis.reshape(len(first.basis), -1)
+    guessed = (_least_squares(first, offsets[gaps], weights[gaps]) @ flat).reshape(len(gaps), *offsets.shape[1:])
+    result[gaps] = share * offsets[gaps] + (1 - share) * guessed
+    return result
+
+
+def _least_squares(
     space: ShapeSpace, offsets: Float[np.ndarray, "frames verts 3"], weights: Float[np.ndarray, "frames verts"]
 ) -> Float64[np.ndarray, "frames shapes"]:
-    """Weighted projection. A frame without gaps is projected plainly, and so exactly.
+    """Weighted projection.
 
-    With gaps, the normal matrix is I - B_m^T (1 - W_m) B_m over the missing vertices m alone, since the basis is
-    orthonormal; the prior on the coefficients grows with what is missing.
+    The normal matrix is I - B_m^T (1 - W_m) B_m over the missing vertices m alone, since the basis is orthonormal; the
+    prior on the coefficients grows with what is missing.
     """
     flat = space.basis.reshape(len(space.basis), -1)
     result = (offsets * weights[..., None]).reshape(len(offsets), -1) @ flat.T
     precision = PRIOR_NOISE_M**2 / np.maximum(space.std, 1e-9) ** 2
-    for row in np.flatnonzero((weights < 1).any(axis=1)):
-        missing = np.flatnonzero(weights[row] < 1)
-        lost = 1 - weights[row, missing]
-        columns = space.basis[:, missing]
-        scaled = (columns * np.sqrt(lost)[:, None]).reshape(len(flat), -1)
+    for row, known in enumerate(weights):
+        missing = np.flatnonzero(known < 1)
+        lost = 1 - known[missing]
+        scaled = (space.basis[:, missing] * np.sqrt(lost)[:, None]).reshape(len(flat), -1)
         normal = np.eye(len(flat)) - scaled @ scaled.T
-        normal[np.diag_indices(len(flat))] += precision * lost.sum() / weights.shape[1]
+        normal[np.diag_indices(len(flat))] += precision * lost.sum() / len(known)
         result[row] = np.linalg.solve(normal, result[row])
     return result
+
+
+def _coefficients(
+    space: ShapeSpace, offsets: Float[np.ndarray, "frames verts 3"], weights: Float[np.ndarray, "frames verts"]
+) -> Float64[np.ndarray, "frames shapes"]:
+    """Projection with gaps filled in; a frame without gaps is projected plainly, and so exactly."""
+    flat = space.basis.reshape(len(space.basis), -1)
+    return _filled(space, offsets, weights).reshape(len(offsets), -1) @ flat.T
 
 
 def project(

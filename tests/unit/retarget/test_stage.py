@@ -106,7 +106,7 @@ def test_fit_again_changes_nothing_and_other_settings_are_refused(model: Path, w
 def test_the_captured_motion_on_the_captured_person_is_the_capture(model: Path, works, tmp_path: Path) -> None:
     output = tmp_path / "again"
     poses = works[0] / "body" / "poses.npz"
-    assert run(*animate(model, poses, output, "--regressor", "linear", "--no-removal.enabled")) == 0
+    assert run(*animate(model, poses, output, "--regressor", "linear", "--removal.no-enabled")) == 0
     found, wanted = (load_registration(each / "registration") for each in (output, works[0]))
     good = np.delete(np.arange(16), 4)
     apart = np.linalg.norm(found.vertices[good] - wanted.vertices[good], axis=-1)
