@@ -85,6 +85,8 @@ def run(
         raise InputError(f"{known.folder}: expected an LSTM in the model, found a linear regression only")
     person = _person(known, body, beta)
     motion = _motion(known, poses, person)
+    if (output / "body" / "stage.json").is_file():
+        raise InputError(f"{output}: expected a folder for the animation alone, found a take with a tracked body")
     folder = output / "registration"
     upstream = {"model": known.digest, "poses": file_digest([poses], root=poses.parent), "lstm": "none"}
     if body is not None:

@@ -216,6 +216,14 @@ def test_poses_of_another_skeleton_are_one_line(model: Path, motion, tmp_path: P
     assert "NaN" in fails(capsys, *animate(model, tmp_path / "poses.npz", tmp_path / "x", "--beta", "nan"))
 
 
+def test_a_tracked_take_is_never_written_over(model: Path, works, tmp_path: Path, capsys) -> None:
+    poses = works[0] / "body" / "poses.npz"
+    assert "found output of 'register'" in fails(capsys, *animate(model, poses, works[1]))
+    (tmp_path / "tracked" / "body").mkdir(parents=True)
+    (tmp_path / "tracked" / "body" / "stage.json").write_text("{}")
+    assert "found a take with a tracked body" in fails(capsys, *animate(model, poses, tmp_path / "tracked"))
+
+
 def test_damaged_models_are_one_line(model: Path, works, tmp_path: Path, capsys) -> None:
     poses = works[0] / "body" / "poses.npz"
     path = model / "blendshapes.safetensors"
