@@ -27,7 +27,7 @@ from data_synth.config import TRAINING_SETS, TrainingSetConfig
 from registration.config import RegistrationConfig
 from retarget.learning import Take, UnposedTakes
 from retarget.pose_normalisation import PoseRows, unpose_sequence
-from retarget.splits import Piece
+from retarget.splits import Piece, Role
 
 __all__ = ["Lesson", "lesson", "training_set", "true_places", "true_take"]
 
@@ -96,7 +96,7 @@ def lesson(config: TrainingSetConfig, folder: Path, *, truth: bool, tracked: boo
     )
 
 
-def _role(name: str, config: TrainingSetConfig, names: Sequence[str]):
+def _role(name: str, config: TrainingSetConfig, names: Sequence[str]) -> Role:
     """The last clip that is learned from validates."""
     if name in config.held_out or name in config.reversed:
         return "held out"

@@ -19,10 +19,11 @@ from capture4d.evaluation import correspondence_errors
 from capture4d.scans import read_capture
 from capture4d.types import BlendshapeModel, PoseSequence, RegisteredSequence
 from data_synth.config import TrainingSetConfig
-from retarget.animation import Animator
+from retarget.animation import AnimatedFrame, Animator
 from retarget.blendshapes import ShapeSpace, as_model_arrays, project
 from retarget.bodies import retargeted_mean
 from retarget.config import AnimateConfig, RemovalConfig, ShapeConfig
+from retarget.intersections import Removed
 from retarget.learning import learn_shapes
 
 METHODS = ("naive", "eq5", "default")
@@ -69,10 +70,10 @@ def _on(
     config: TrainingSetConfig,
     folder: Path,
     every: int,
-) -> tuple[dict[str, float], list]:
+) -> tuple[dict[str, float], list[Removed]]:
     """Mean vertex errors of each method on one person, millimetres, and what removal did."""
     errors: dict[str, list[float]] = {method: [] for method in METHODS}
-    removals = []
+    removals: list[Removed] = []
     names = list(config.takes)
     for clip in config.held_out:
         truth, person, poses, _ = true_take(read_capture(folder / "bodies" / who / clip))
@@ -98,7 +99,7 @@ def _animated(
     poses: PoseSequence,
     coefficients: np.ndarray,
     rows: range,
-) -> list:
+) -> list[AnimatedFrame]:
     settings = AnimateConfig(
         mean="captured" if method == "naive" else "corrected", removal=RemovalConfig(enabled=method == "default")
     )

@@ -11,7 +11,7 @@ import numpy as np
 from capture4d.errors import InputError
 from retarget.config import SplitConfig
 
-__all__ = ["Piece", "split_takes"]
+__all__ = ["Piece", "Role", "split_takes"]
 
 Role = Literal["training", "validation", "held out"]
 
@@ -42,14 +42,16 @@ def split_takes(names: Sequence[str], lengths: Sequence[int], fps: float, config
     rest = [take for take in range(len(names)) if take not in held_out and take not in named]
     if not rest:
         raise InputError(f"split: expected a take to learn from, found {len(names)} that are all set aside")
-    whole = [(take, "held out") for take in held_out] + [(take, "validation") for take in named]
+    whole: list[tuple[int, Role]] = [(take, "held out") for take in held_out]
+    whole += [(take, "validation") for take in named]
     if not named and config.validation_share > 0:
         if len(rest) == 1:
             return (*_pieces(whole, lengths), *_cut(rest[0], lengths[rest[0]], fps, config))
         chosen = _some_takes(rest, lengths, config)
         whole += [(take, "validation") for take in chosen]
         rest = [take for take in rest if take not in chosen]
-    return _pieces([*whole, *((take, "training") for take in rest)], lengths)
+    whole += [(take, "training") for take in rest]
+    return _pieces(whole, lengths)
 
 
 def _pieces(roles: Sequence[tuple[int, Role]], lengths: Sequence[int]) -> tuple[Piece, ...]:
