@@ -93,7 +93,7 @@ class World:
         turns = (
             Rotation.from_matrix(poses.rotations[:, 1:].reshape(-1, 3, 3)).as_rotvec().reshape(len(poses.frame_ids), -1)
         )
-        late = np.concatenate([turns[:1].repeat(2, 0), turns[:-2]])
+        late = turns[np.maximum(np.arange(len(turns)) - 2, 0)]
         linear = turns @ self.mixing
         return linear + self.lag * (late @ self.mixing) * np.abs(linear)
 

@@ -36,7 +36,7 @@ def test_the_mean_follows_the_body_and_the_captured_shape_counts_once(garment, b
     np.testing.assert_allclose(grown, 0.02, atol=5e-3)  # smoothed along a coarse tube
     printed = retargeted_mean(model, captured, with_shape(body, np.array([2.0, 0.0])), formula="printed")
     twice = np.linalg.norm(printed[:, [0, 2]], axis=1) - np.linalg.norm(model.mean[:, [0, 2]], axis=1)
-    np.testing.assert_allclose(twice, 2 * grown, atol=1e-6)
+    np.testing.assert_allclose(twice, 2 * grown, atol=5e-4)
     as_is = retargeted_mean(model, captured, with_shape(body, np.array([2.0, 0.0])), formula="captured")
     np.testing.assert_array_equal(as_is, model.mean)
 
