@@ -70,15 +70,16 @@ def read_tensors(path: str | Path, kind: str) -> TensorFile:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file")
-    with path.open("rb") as file:
-        start = file.read(4)
-    if start.startswith(_PICKLE_STARTS):
-        raise InputError(f"{path}: expected a safetensors file, found a pickle or an archive, which is not opened")
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
             note = json.loads((file.metadata() or {}).get(_NOTE, "{}"))
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
     except (safetensors.SafetensorError, json.JSONDecodeError) as error:
+        with path.open("rb") as stream:
+            start = stream.read(4)
+        if start.startswith(_PICKLE_STARTS):  # a header of 128 bytes begins like a pickle, but it can be read
+            message = "expected a safetensors file, found a pickle or an archive, which is not opened"
+            raise InputError(f"{path}: {message}") from None
         raise InputError(f"{path}: not a readable safetensors file, cut off or damaged ({error})") from None
     if note.get("kind") != kind:
         raise InputError(f"{path}: expected {kind}, found {note.get('kind') or 'a file of somebody else'}")
