@@ -53,7 +53,7 @@ def test_a_model_comes_back_whole(tmp_path: Path, uv: bool) -> None:
 
 def test_a_model_wants_weights_for_its_joints() -> None:
     model = some_model()
-    with pytest.raises(InputError, match="expected skin weights of 3 joints, found 2"):
+    with pytest.raises(InputError, match="expected skin weights for 3 joints, found weights for 2"):
         BlendshapeModel(model.garment, model.mean, model.basis, model.std, ("a", "b", "c"), 60.0)
 
 
