@@ -13,12 +13,13 @@ References: the least squares of TailorNet's published code (CVPR 2020), with we
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int32
 from scipy import sparse
-from scipy.sparse.linalg import LinearOperator, cg, splu
+from scipy.sparse.linalg import splu
 
 from capture4d.mesh import vertex_adjacency, vertex_normals
 from capture4d.open3d_loading import import_open3d
@@ -28,6 +29,8 @@ __all__ = ["BodySurface", "IntersectionRemoval", "Penetration", "Removed"]
 
 EDGE_MIDDLES = np.array([[1, 1, 0], [0, 1, 1], [1, 0, 1], [2 / 3, 2 / 3, 2 / 3]]) / 2
 """Where a face is probed: the middles of its edges, and its own."""
+TOLERANCE, MOST_STEPS = 1e-6, 200
+"""Relative residual at which conjugate gradients stop; the preconditioner leaves them a condition of `leave`/`stay`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,9 +96,9 @@ class IntersectionRemoval:
     def __init__(self, faces: Int32[np.ndarray, "faces 3"], count: int, config: RemovalConfig) -> None:
         self._faces, self._config = faces, config
         adjacency = vertex_adjacency(faces, count).astype(np.float64)
-        degree = np.maximum(np.asarray(adjacency.sum(axis=1)).ravel(), 1.0)
-        connected = (np.diff(adjacency.indptr) > 0).astype(np.float64)
-        laplacian = sparse.diags_array(connected) - sparse.diags_array(1.0 / degree) @ adjacency
+        degree = np.asarray(adjacency.sum(axis=1)).ravel()
+        connected = (degree > 0).astype(np.float64)
+        laplacian = sparse.diags_array(connected) - sparse.diags_array(1.0 / np.maximum(degree, 1.0)) @ adjacency
         self._stiffness = (laplacian.T @ laplacian).tocsr()
         self._factor = splu((self._stiffness + config.stay * sparse.eye_array(count)).tocsc())
 
@@ -150,7 +153,25 @@ class IntersectionRemoval:
         """Displacements, (V, 3), by conjugate gradients; the factor without `leaving` is nearly the inverse."""
         diagonal = np.where(leaving, leave, self._config.stay)
         matrix = (self._stiffness + sparse.diags_array(diagonal)).tocsr()
-        nearly = LinearOperator(matrix.shape, matvec=self._factor.solve, dtype=np.float64)
         right = np.where(leaving[:, None], leave * wanted, 0.0)
-        columns = [cg(matrix, right[:, axis], rtol=1e-6, atol=1e-9, maxiter=200, M=nearly)[0] for axis in range(3)]
-        return np.stack(columns, axis=1)
+        return _conjugate_gradients(matrix, right, self._factor.solve)
+
+
+def _conjugate_gradients(
+    matrix: sparse.csr_array, right: Float64[np.ndarray, "verts 3"], precondition: Callable[[np.ndarray], np.ndarray]
+) -> Float64[np.ndarray, "verts 3"]:
+    """Solve for each column of a positive definite system, all columns at once."""
+    found, residual = np.zeros_like(right), right.copy()
+    enough = TOLERANCE * np.linalg.norm(right, axis=0)
+    direction = better = precondition(residual)
+    product = (residual * better).sum(axis=0)
+    for _ in range(MOST_STEPS):
+        if np.all(np.linalg.norm(residual, axis=0) <= enough):
+            break
+        image = matrix @ direction
+        step = product / np.maximum((direction * image).sum(axis=0), 1e-300)
+        found, residual = found + step * direction, residual - step * image
+        better = precondition(residual)
+        before, product = product, (residual * better).sum(axis=0)
+        direction = better + product / np.maximum(before, 1e-300) * direction
+    return found

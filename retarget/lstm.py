@@ -84,11 +84,13 @@ class LstmRegressor:
             stream = self.stream()
             return np.array([stream.push(row) for row in controls], np.float32).reshape(-1, len(self.scales.std))
         windows = frame_windows(self.scales.standardised(controls), self.config.window)
-        answers = [self._answer(windows[start : start + BATCH]) for start in range(0, len(windows), BATCH)]
+        answers = [self.answer_windows(windows[start : start + BATCH]) for start in range(0, len(windows), BATCH)]
         result = np.concatenate([np.zeros((0, len(self.scales.std)), np.float32), *answers])
         return result if self.linear is None else result + self.linear.predict(controls)
 
-    def _answer(self, windows: Float32[np.ndarray, "windows frames controls"]) -> Float32[np.ndarray, "windows shapes"]:
+    def answer_windows(
+        self, windows: Float32[np.ndarray, "windows frames controls"]
+    ) -> Float32[np.ndarray, "windows shapes"]:
         """Coefficients of the last frame of each window."""
         device = self.network.head.weight.device
         with torch.inference_mode():
@@ -111,7 +113,7 @@ class LstmStream:
         while len(self._window) < regressor.config.window - 1:
             self._window.append(known)
         self._window.append(known)
-        answer = regressor._answer(np.stack(self._window)[None])[0]
+        answer = regressor.answer_windows(np.stack(self._window)[None])[0]
         if self._linear is not None:
             answer = answer + self._linear.push(controls)
         self._history.push(answer / regressor.scales.std)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -11,9 +11,10 @@ import numpy as np
 from capture4d.errors import InputError
 from retarget.config import SplitConfig
 
-__all__ = ["Piece", "Role", "split_takes"]
+__all__ = ["ROLES", "Piece", "Role", "split_takes"]
 
 Role = Literal["training", "validation", "held out"]
+ROLES: tuple[Role, ...] = ("training", "validation", "held out")
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,20 +43,20 @@ def split_takes(names: Sequence[str], lengths: Sequence[int], fps: float, config
     rest = [take for take in range(len(names)) if take not in held_out and take not in named]
     if not rest:
         raise InputError(f"split: expected a take to learn from, found {len(names)} that are all set aside")
-    whole: list[tuple[int, Role]] = [(take, "held out") for take in held_out]
-    whole += [(take, "validation") for take in named]
+    roles: dict[int, Role] = dict.fromkeys(held_out, "held out")
+    roles.update(dict.fromkeys(named, "validation"))
     if not named and config.validation_share > 0:
         if len(rest) == 1:
-            return (*_pieces(whole, lengths), *_cut(rest[0], lengths[rest[0]], fps, config))
+            return (*_pieces(roles, lengths), *_cut(rest[0], lengths[rest[0]], fps, config))
         chosen = _some_takes(rest, lengths, config)
-        whole += [(take, "validation") for take in chosen]
+        roles.update(dict.fromkeys(chosen, "validation"))
         rest = [take for take in rest if take not in chosen]
-    whole += [(take, "training") for take in rest]
-    return _pieces(whole, lengths)
+    roles.update(dict.fromkeys(rest, "training"))
+    return _pieces(roles, lengths)
 
 
-def _pieces(roles: Sequence[tuple[int, Role]], lengths: Sequence[int]) -> tuple[Piece, ...]:
-    return tuple(Piece(take, range(lengths[take]), role) for take, role in sorted(roles))
+def _pieces(roles: Mapping[int, Role], lengths: Sequence[int]) -> tuple[Piece, ...]:
+    return tuple(Piece(take, range(lengths[take]), role) for take, role in sorted(roles.items()))
 
 
 def _some_takes(takes: Sequence[int], lengths: Sequence[int], config: SplitConfig) -> list[int]:

@@ -55,8 +55,8 @@ from retarget.learning import (
 from retarget.linear import LinearRegressor, fit_linear, load_linear, mean_squared_error, save_linear
 from retarget.pose_normalisation import PoseRows, unpose_sequence
 from retarget.pose_range import PoseRange, load_pose_range, save_pose_range
-from retarget.regressors import Regressor
-from retarget.splits import Piece, split_takes
+from retarget.regressors import Clip, Regressor
+from retarget.splits import ROLES, Piece, Role, split_takes
 
 __all__ = ["GarmentModel", "load_garment_model", "run"]
 
@@ -113,7 +113,7 @@ def run(
     save_pose_range(output / POSES, known, model_digest=_digest(output))
     note = shape_note | _regressors(stage, takes, pieces, layout, shape_space(model), config, device)
     split = {role: [_piece_name(names, piece) for piece in pieces if piece.role == role]
-             for role in ("training", "validation", "held out")}  # fmt: skip
+             for role in ROLES}  # fmt: skip
     write_json(output / "fit.json", {"split": split, "validated_deg": known.validated_deg, **note})
     return _finish(stage)
 
@@ -232,7 +232,7 @@ def _blendshapes(
     )  # fmt: skip
     save_blendshapes(path, model)
     note: dict[str, Any] = {"directions": len(std), "directions_for_max_error": fewest}
-    for role in ("training", "validation", "held out"):
+    for role in ROLES:
         rows = takes.rows(pieces, role)
         if len(rows):
             mean_m, worst_m = _errors(takes, rows, space)
@@ -260,9 +260,7 @@ def _regressors(
 ) -> dict[str, Any]:
     """Learn what is not there yet, and measure all of it."""
     digest = _digest(stage.path)
-    clips = {
-        role: regression_clips(takes, pieces, role, layout, space) for role in ("training", "validation", "held out")
-    }
+    clips = {role: regression_clips(takes, pieces, role, layout, space) for role in ROLES}
     linear = fit_linear(clips["training"], clips["validation"], layout, space.std, config.linear)
     save_linear(stage.path / LINEAR, linear, model_digest=digest)
     regressors: dict[str, Regressor] = {"linear": linear}
@@ -283,7 +281,7 @@ def _regressors(
 
 def _network(
     stage: Stage,
-    clips: Mapping[str, Sequence[Any]],
+    clips: Mapping[Role, Sequence[Clip]],
     layout: ControlLayout,
     space: ShapeSpace,
     linear: LinearRegressor,

@@ -409,10 +409,12 @@ class Fit(_Stage):
 
         if not self.works:
             raise InputError("WORK: expected at least one work folder, found none")
-        if self.output is None and len(self.works) > 1:
-            raise InputError(f"--output: expected a work folder for what {len(self.works)} takes give, found none")
-        folder = (self.output or self.works[0]) / "retarget"
-        run(self.works, folder, self.config, device=self.device, workers=self.workers, overwrite=self.overwrite)
+        first, *others = self.works
+        if self.output is None and others:
+            raise InputError(f"--output: expected a work folder for what {1 + len(others)} takes give, found none")
+        folder = (self.output or first) / "retarget"
+        works = [first, *others]
+        run(works, folder, self.config, device=self.device, workers=self.workers, overwrite=self.overwrite)
         print(f"model: {folder}")
         return 0
 
