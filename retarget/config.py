@@ -67,7 +67,7 @@ class LinearConfig:
 
     fit: Literal["ridge", "moore-penrose"] = "ridge"
     """Least squares with an intercept, or F = L T^+ as the paper prints it, without."""
-    ridges: tuple[float, ...] = (0.0, 1e-4, 1e-3, 1e-2, 0.1, 0.3, 1.0, 3.0, 10.0)
+    ridges: tuple[float, ...] = (0.0, 1e-4, 1e-3, 1e-2, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
     """Penalties to choose from on the validation clips, relative to the mean variance of the controls."""
 
 
