@@ -18,7 +18,7 @@ from capture4d.mesh import vertex_adjacency
 from capture4d.open3d_loading import import_open3d
 from capture4d.types import Body, Garment
 
-__all__ = ["WEIGHT_SMOOTHING", "bind", "diffuse", "with_body_shape"]
+__all__ = ["WEIGHT_SMOOTHING", "bind", "diffuse", "embedded_offset", "with_body_shape"]
 
 WEIGHT_SMOOTHING = 12
 """Diffusion steps on the skin weights: nearest body points jump from trunk to arm under a sleeve."""
@@ -70,13 +70,26 @@ def with_body_shape(garment: Garment, body: Body, shape: Float[np.ndarray, " sha
     """
     if garment.body_shape is None or garment.embedding_faces is None or garment.embedding_barycentric is None:
         return garment
+    change = with_shape(body, shape).vertices - with_shape(body, garment.body_shape).vertices
+    moved = garment.template.vertices + embedded_offset(garment, body, change)
+    template = garment.template.with_vertices(moved.astype(np.float32))
+    return replace(garment, template=template, body_shape=np.asarray(shape, np.float32))
+
+
+def embedded_offset(garment: Garment, body: Body, change: Float[np.ndarray, "skin 3"]) -> Float[np.ndarray, "verts 3"]:
+    """How the garment moves, in the rest pose, when the body's surface changes: with the points it is bound to.
+
+    Args:
+        change: displacement of each body vertex, metres.
+    Raises:
+        InputError: the garment is not bound, or to faces that the body does not have.
+    """
+    if garment.embedding_faces is None or garment.embedding_barycentric is None:
+        raise InputError("template: expected an embedding in the body, found none; bind it to a body")
     if garment.embedding_faces.max(initial=0) >= len(body.template.faces):
         count = len(body.template.faces)
         raise InputError(f"template: expected an embedding in the body's {count} faces, found face "
                          f"{garment.embedding_faces.max()}")  # fmt: skip
-    change = with_shape(body, shape).vertices - with_shape(body, garment.body_shape).vertices
     corners = change[body.template.faces[garment.embedding_faces]]
     offset = np.einsum("vk,vkc->vc", garment.embedding_barycentric, corners)
-    offset = diffuse(offset, garment.template.faces, OFFSET_SMOOTHING)
-    moved = garment.template.with_vertices((garment.template.vertices + offset).astype(np.float32))
-    return replace(garment, template=moved, body_shape=np.asarray(shape, np.float32))
+    return diffuse(offset, garment.template.faces, OFFSET_SMOOTHING)

@@ -18,6 +18,7 @@ from jaxtyping import Float32, Int32, UInt8
 from capture4d.errors import InputError, NotFiniteError
 
 __all__ = [
+    "BlendshapeModel",
     "Body",
     "Garment",
     "GarmentScan",
@@ -258,3 +259,43 @@ class RegisteredSequence:
         _require_array("RegisteredSequence", "residual_m", self.residual_m, (frames, verts), np.float32)
         _require_array("RegisteredSequence", "frame_ids", self.frame_ids, (frames,), np.int32)
         _require_finite("RegisteredSequence", "vertices", self.vertices)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BlendshapeModel:
+    """A garment learned from registered frames: a mean and its principal directions, in the unposed space.
+
+    A frame is `mean + coefficients @ basis`, skinned with `garment.skin_weights` (DeepWrinkles, Eq. 3, whose sum runs
+    over l = 1..k).
+    """
+
+    garment: Garment
+    """Template, borders and skin weights; its `body_shape` is that of the person who was captured."""
+    mean: Float32[np.ndarray, "verts 3"]
+    """Metres, on the captured person in the rest pose."""
+    basis: Float32[np.ndarray, "shapes verts 3"]
+    """Orthonormal directions, the strongest first."""
+    std: Float32[np.ndarray, " shapes"]
+    """Standard deviation of each coefficient over the training frames, metres."""
+    joint_names: tuple[str, ...]
+    """Of the skeleton that moves the garment, in the order of the skin weights' columns."""
+    fps: float
+    """Frame rate of the takes it was learned from."""
+    licence: str = ""
+    """Who may do what with it; goes wherever the file goes."""
+
+    def __post_init__(self) -> None:
+        verts, shapes = len(self.garment.template.vertices), len(self.std)
+        _require_array("BlendshapeModel", "mean", self.mean, (verts, 3), np.float32)
+        _require_array("BlendshapeModel", "basis", self.basis, (shapes, verts, 3), np.float32)
+        _require_array("BlendshapeModel", "std", self.std, (shapes,), np.float32)
+        for name in ("mean", "basis", "std"):
+            _require_finite("BlendshapeModel", name, getattr(self, name))
+        weights = self.garment.skin_weights
+        if weights is None or weights.shape[1] != len(self.joint_names):
+            found = "none" if weights is None else f"weights for {weights.shape[1]}"
+            raise InputError(
+                f"BlendshapeModel: expected skin weights for {len(self.joint_names)} joints, found {found}"
+            )
+        if not self.fps > 0:
+            raise InputError(f"BlendshapeModel.fps: expected a positive frame rate, found {self.fps}")

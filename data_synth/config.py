@@ -8,7 +8,9 @@ from typing import Literal
 from data_synth.outfits import OutfitName
 from data_synth.scanner_config import FusionConfig, RigConfig, ScannerConfig, StereoConfig
 
-ClipName = Literal["range-of-motion", "twist", "reach", "side-bend", "sampled"]
+ClipName = Literal[
+    "range-of-motion", "twist", "reach", "side-bend", "walk", "hop", "arm-circles", "reach-twist", "sampled"
+]
 
 
 @dataclass(frozen=True)
@@ -21,6 +23,10 @@ class MotionConfig:
     """A BVH file to follow instead of a clip."""
     skip_frames: int = 0
     """Frames to leave out at the start of the motion, 60 a second."""
+    seed: int = 0
+    """Varies the motion of the same subject in the same garment."""
+    reverse: bool = False
+    """Backwards in time."""
 
 
 @dataclass(frozen=True)
@@ -147,6 +153,11 @@ class SynthConfig:
     """Simulated frames (60 a second) per captured frame."""
     body_shape: tuple[float, ...] = ()
     """Shape coefficients of the subject, in standard deviations: the first is height, the second girth."""
+    drafted_for: tuple[float, ...] | None = None
+    """Shape of the person for whom the garment was drafted and meshed, if it is somebody else: the same garment, vertex
+    for vertex, graded to the subject."""
+    scans: bool = True
+    """Off: the cloth and its truth alone."""
     mocap_noise_deg: float = 0.3
     """Error of the joint angles in the capture's poses.npz, standard deviation; truth/ holds the exact ones."""
     template_vertices: int = 5000
@@ -197,3 +208,95 @@ PRESETS: dict[str, SynthConfig] = {
     "tshirt-linen-200k": replace(_FULL, name="tshirt-linen-200k", fabric="linen", seed=2),
 }
 """Takes by name, from minutes to an hour."""
+
+
+@dataclass(frozen=True)
+class TrainingSetConfig:
+    """Takes to learn a garment from: one subject, one garment, one template, many clips."""
+
+    name: str
+    takes: dict[str, SynthConfig]
+    """Clips by name; every one starts from the same seed and so wears the same garment."""
+    held_out: tuple[str, ...]
+    """Clips that are not learned from."""
+    reversed: tuple[str, ...]
+    """Clips that run backwards, not learned from either."""
+    bodies: dict[str, tuple[float, ...]]
+    """Other people, by shape coefficients. The held-out clips are simulated on each, without scans, in the same garment
+    graded to them."""
+
+
+OTHER_BODIES: dict[str, tuple[float, ...]] = {
+    "thin": (0.0, -2.0),
+    "heavy": (0.0, 2.0),
+    "tall": (1.5, 0.0),
+    "short": (-1.5, 0.0),
+}
+
+
+def _clips(base: SynthConfig, clips: dict[str, MotionConfig]) -> dict[str, SynthConfig]:
+    """Clips that run backwards are half as long."""
+    return {
+        name: replace(
+            base,
+            name=f"{base.name}-{name}",
+            motion=motion,
+            frames=base.frames // 2 if motion.reverse else base.frames,
+        )
+        for name, motion in clips.items()
+    }
+
+
+_TRAIN = replace(_FULL, name="tshirt-train", frames=150)
+_TINY_TRAIN = replace(
+    PRESETS["tiny"],
+    name="tiny-train",
+    frames=16,
+    capture_every=2,
+    template_vertices=700,
+    simulation=replace(PRESETS["tiny"].simulation, vertices=900, calm_frames=12, approach_frames=10, rest_frames=4),
+    relaxation=RelaxationConfig(vertices=4_000, sweeps=20),
+)
+TRAINING_SETS: dict[str, TrainingSetConfig] = {
+    "tshirt-train": TrainingSetConfig(
+        "tshirt-train",
+        _clips(
+            _TRAIN,
+            {
+                "range-of-motion": MotionConfig("range-of-motion"),
+                "twist": MotionConfig("twist"),
+                "reach": MotionConfig("reach"),
+                "side-bend": MotionConfig("side-bend"),
+                "walk": MotionConfig("walk"),
+                "hop": MotionConfig("hop"),
+                "arm-circles": MotionConfig("arm-circles"),
+                "sampled-1": MotionConfig("sampled", seed=1),
+                "sampled-2": MotionConfig("sampled", seed=2),
+                "reach-twist": MotionConfig("reach-twist"),
+                "sampled-3": MotionConfig("sampled", seed=3),
+                "twist-reversed": MotionConfig("twist", skip_frames=75, reverse=True),
+                "sampled-3-reversed": MotionConfig("sampled", skip_frames=75, seed=3, reverse=True),
+            },
+        ),
+        held_out=("reach-twist", "sampled-3"),
+        reversed=("twist-reversed", "sampled-3-reversed"),
+        bodies=OTHER_BODIES,
+    ),
+    "tiny-train": TrainingSetConfig(
+        "tiny-train",
+        _clips(
+            _TINY_TRAIN,
+            {
+                "twist": MotionConfig("twist"),
+                "reach": MotionConfig("reach"),
+                "reach-twist": MotionConfig("reach-twist"),
+                "twist-reversed": MotionConfig("twist", reverse=True),
+            },
+        ),
+        held_out=("reach-twist",),
+        reversed=("twist-reversed",),
+        bodies=OTHER_BODIES,
+    ),
+}
+"""Sets of takes by name. `tshirt-train` has 1,800 frames with scans and 1,200 without, which by the costs that
+`python -m benchmarks synthesis` prints is about 14,000 CPU seconds; `tiny-train` is its small likeness."""

@@ -25,11 +25,26 @@ from data_synth.config import ClipName, MotionConfig
 __all__ = ["make_motion", "random_pose", "sample_poses", "scripted_clip"]
 
 Keyframe = tuple[float, dict[str, float]]
-"""Time in seconds, and controls in degrees; a control that is not named keeps its last value, 0 at the start."""
+"""Time in seconds, and controls in degrees, or in centimetres where their names say so; a control that is not named
+keeps its last value, 0 at the start."""
 
 HANGING, OVERHEAD = -25.0, 116.0
 """Lateral arm raise from the rest pose, whose arms point about 49 degrees below the horizontal. Hanging arms keep 16
 degrees from the vertical, as subjects are asked to: 3 degrees less, and the sides of a shirt are out of sight."""
+
+
+def _walk(steps: int) -> list[Keyframe]:
+    """Steps of half a second, there and back again; arms swing against the legs."""
+    frames: list[Keyframe] = [(0.0, {"raise_both": HANGING})]
+    for step in range(steps):
+        side = 1 if step % 2 == 0 else -1
+        frames.append((0.5 * step + 0.25, {"lift_cm": 1.5}))
+        swing = {"leg_left": 22.0 * side, "leg_right": -22.0 * side, "knee_left": 6.0, "knee_right": 6.0}
+        arms = {"forward_left": -24.0 * side, "forward_right": 24.0 * side, "twist": 7.0 * side}
+        away = 12.0 * (step + 1 if step < steps / 2 else steps - step - 1)
+        frames.append((0.5 * step + 0.5, {**swing, **arms, "lift_cm": -2.0, "travel_cm": away}))
+    return frames
+
 
 CLIPS: dict[str, list[Keyframe]] = {
     "range-of-motion": [
@@ -62,6 +77,37 @@ CLIPS: dict[str, list[Keyframe]] = {
         (2.3, {"side": 0, "raise_both": 60, "bend": 18}),
         (3.0, {"raise_both": -28, "bend": 0}),
     ],
+    "walk": _walk(6),
+    "hop": [
+        (0.0, {"raise_both": -22}),
+        (0.4, {"leg_both": 28, "knee_both": 56, "lift_cm": -10, "bend": 14, "forward_both": -20}),
+        (0.6, {"leg_both": 0, "knee_both": 4, "lift_cm": 4, "bend": 0, "forward_both": 55}),
+        (0.75, {"lift_cm": 13}),
+        (0.95, {"lift_cm": 0}),
+        (1.1, {"leg_both": 22, "knee_both": 44, "lift_cm": -6, "bend": 10, "forward_both": 0}),
+        (1.5, {"leg_both": 26, "knee_both": 52, "lift_cm": -8, "raise_both": -10}),
+        (1.7, {"leg_both": 0, "knee_both": 4, "lift_cm": 5, "bend": 0, "raise_both": 70}),
+        (1.85, {"lift_cm": 14}),
+        (2.05, {"lift_cm": 0, "raise_both": 20}),
+        (2.25, {"leg_both": 15, "knee_both": 30, "lift_cm": -3}),
+        (2.7, {"leg_both": 0, "knee_both": 0, "lift_cm": 0, "raise_both": -22}),
+    ],
+    "arm-circles": [
+        (0.0, {"raise_both": -20}),
+        (0.5, {"forward_both": 85}),
+        (1.0, {"forward_both": 20, "raise_both": 95}),
+        (1.4, {"forward_both": -20, "raise_both": 35}),
+        (1.8, {"forward_both": 0, "raise_both": -20}),
+        (2.2, {"raise_left": 60, "forward_right": 70, "elbow_right": 50}),
+        (2.6, {"raise_left": -20, "forward_right": 0, "elbow_right": 0}),
+    ],
+    "reach-twist": [
+        (0.0, {"raise_both": -22}),
+        (0.6, {"twist": 24, "forward_right": 60, "raise_right": 15}),
+        (1.2, {"twist": -10, "forward_right": 10, "raise_right": 60, "bend": 8}),
+        (1.8, {"twist": -26, "forward_left": 65, "raise_right": -22, "side": -8}),
+        (2.5, {"twist": 0, "forward_left": 0, "bend": 0, "side": 0, "raise_both": -22}),
+    ],
 }
 
 
@@ -81,18 +127,18 @@ def make_motion(
                 f"{config.bvh}: expected at least {wanted} frames at {fps:g} fps, "
                 f"found {config.skip_frames + len(poses.frame_ids)}"
             )
-        return _cut(poses, 0, frames)
+        return _cut(poses, 0, frames, reverse=config.reverse)
     if config.clip == "sampled":
         poses = sample_poses(shaped, fps, wanted, rng)
     elif config.clip in CLIPS:
         poses = scripted_clip(shaped, CLIPS[config.clip], fps, wanted, rng)
     else:
         raise InputError(f"clip: expected one of {', '.join(get_args(ClipName))}, found {config.clip!r}")
-    return _cut(poses, config.skip_frames, frames)
+    return _cut(poses, config.skip_frames, frames, reverse=config.reverse)
 
 
-def _cut(poses: PoseSequence, start: int, frames: int) -> PoseSequence:
-    kept = slice(start, start + frames)
+def _cut(poses: PoseSequence, start: int, frames: int, *, reverse: bool) -> PoseSequence:
+    kept = np.arange(start, start + frames)[:: -1 if reverse else 1]
     return PoseSequence(
         poses.rotations[kept],
         poses.translations[kept],
@@ -122,7 +168,9 @@ def scripted_clip(
             levels.append(last)
         amplitude = 1 + 0.04 * rng.standard_normal()
         values[name] = amplitude * PchipInterpolator(times, levels)(at)
-    return pose_sequence(shaped, _control_rotations(shaped, values, frames), fps)
+    still = np.zeros(frames)
+    path = np.stack([still, values.get("lift_cm", still), values.get("travel_cm", still)], axis=1) / 100
+    return pose_sequence(shaped, _control_rotations(shaped, values, frames), fps, path)
 
 
 def _both_sides(controls: dict[str, float]) -> dict[str, float]:
@@ -153,6 +201,8 @@ def _control_rotations(shaped: ShapedBody, values: dict[str, np.ndarray], frames
         turn(f"upperarm01.{side}", "x", -0.85 * forward)
         turn(f"upperarm01.{side}", "z", sign * (lateral - girdle))
         turn(f"lowerarm01.{side}", "y", -sign * elbow)
+        turn(f"upperleg01.{side}", "x", -control(f"leg_{word}"))
+        turn(f"lowerleg01.{side}", "x", control(f"knee_{word}"))
     for joint in ("spine04", "spine03", "spine02"):
         turn(joint, "y", control("twist") / 3)
         turn(joint, "x", control("bend") / 3)

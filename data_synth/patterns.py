@@ -11,7 +11,7 @@ equal fractions of arc length, so that vertices of both sides coincide one to on
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -25,11 +25,15 @@ from capture4d.body import ShapedBody
 from capture4d.mesh import boundary_loops
 from data_synth.config import GarmentStyle
 
-__all__ = ["PanelMesh", "Pattern", "locate", "mesh_pattern", "smooth_noise", "tshirt_pattern"]
+__all__ = ["PanelMesh", "Pattern", "grade", "locate", "mesh_pattern", "smooth_noise", "tshirt_pattern"]
 
 LAYOUT_GAP_M = 0.05
 """Free space between panels of the plane domain."""
 NOISE_PIXEL_M = 0.003
+GRADE_SEGMENTS = 40
+"""Sides of each edge of a panel for grading."""
+ON_OUTLINE_M = 5e-4
+"""Nearer than this to the outline a point lies on it: curves are cut into straight sides."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +84,13 @@ class PanelMesh:
     """Border loops: vertex indices in order."""
     seams: Mapping[str, np.ndarray]
     """Vertices along each seam."""
+    drafted_uv: np.ndarray | None = None
+    """(V, 2) `vertex_uv` before the pattern was graded to somebody else."""
+
+    @property
+    def noise_uv(self) -> np.ndarray:
+        """(V, 2) where the cloth's irregularities are drawn: grading moves them along."""
+        return self.vertex_uv if self.drafted_uv is None else self.drafted_uv
 
     @property
     def vertex_count(self) -> int:
@@ -287,6 +298,48 @@ def mesh_pattern(pattern: Pattern, vertex_count: int, rng: np.random.Generator) 
         loops={name: loops[name] for name in pattern.borders},
         seams={name: welded[sides[0]] for name, sides in edge_vertices.items() if len(sides) == 2},
     )
+
+
+def grade(mesh: PanelMesh, drafted: Pattern, graded: Pattern) -> PanelMesh:
+    """The same triangles on the pattern drafted for somebody else: outlines go to outlines, at equal arc length.
+
+    Inside, mean value coordinates (Floater, 2003) carry the vertices along; they reproduce affine maps.
+    """
+    uv, vertex_uv = np.empty_like(mesh.uv), np.empty_like(mesh.vertex_uv)
+    vertex_panels = mesh.face_panels[mesh.vertex_faces]
+    for index, (start, end) in enumerate(zip(drafted.panels, graded.panels, strict=True)):
+        outlines = [
+            np.concatenate([_resample(edge.curve, GRADE_SEGMENTS)[:-1] for edge in panel.edges])
+            for panel in (start, end)
+        ]
+        faces, vertices = mesh.face_panels == index, vertex_panels == index
+        points, where = np.unique(mesh.uv[faces].reshape(-1, 2), axis=0, return_inverse=True)
+        uv[faces] = _carried(points, *outlines)[where.ravel()].reshape(-1, 3, 2)
+        vertex_uv[vertices] = _carried(mesh.vertex_uv[vertices], *outlines)
+    return replace(mesh, uv=uv, vertex_uv=vertex_uv, drafted_uv=mesh.vertex_uv)
+
+
+def _carried(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Points (N, 2) inside the polygon `start`, (P, 2), in the polygon `end`, by mean value coordinates."""
+    result = np.empty_like(points)
+    along = np.roll(start, -1, axis=0) - start
+    for chunk in np.array_split(np.arange(len(points)), len(points) * len(start) // 2_000_000 + 1):
+        spokes = start - points[chunk, None]
+        radius = np.maximum(np.linalg.norm(spokes, axis=2), 1e-12)
+        after, after_radius = np.roll(spokes, -1, axis=1), np.roll(radius, -1, axis=1)
+        cross = spokes[..., 0] * after[..., 1] - spokes[..., 1] * after[..., 0]
+        dot = np.einsum("npx,npx->np", spokes, after)
+        half_tangent = cross / np.maximum(radius * after_radius + dot, 1e-15)
+        weights = (half_tangent + np.roll(half_tangent, 1, axis=1)) / radius
+        inner = (weights @ end) / weights.sum(axis=1, keepdims=True)
+        # On the outline the coordinates are those along its side.
+        share = np.clip(-np.einsum("npx,px->np", spokes, along) / np.einsum("px,px->p", along, along), 0, 1)
+        distance = np.linalg.norm(spokes + share[..., None] * along, axis=2)
+        side, rows = np.argmin(distance, axis=1), np.arange(len(chunk))
+        part = share[rows, side][:, None]
+        border = (1 - part) * end[side] + part * np.roll(end, -1, axis=0)[side]
+        result[chunk] = np.where((distance[rows, side] < ON_OUTLINE_M)[:, None], border, inner)
+    return result
 
 
 def _polygon_area(outline: np.ndarray) -> float:

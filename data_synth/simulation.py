@@ -251,7 +251,7 @@ class _Hold:
         _, _, weights = bind(cloth, mesh.faces, body)
         rest, flagged = unskin(cloth, weights, body.transforms)
         assert not flagged.any(), "the dressing pose cannot be unposed"
-        bumps = smooth_noise(mesh.vertex_uv, config.hold_ripple_m, config.hold_ripple_width_m, np.random.default_rng(1))
+        bumps = smooth_noise(mesh.noise_uv, config.hold_ripple_m, config.hold_ripple_width_m, np.random.default_rng(1))
         shoulder = body.shaped.joints[body.shaped.body.joint_names.index("upperarm01.L")]
         below = np.maximum(shoulder[1] - rest[:, 1], 0) / config.hold_depth_m
         share = config.hold_floor + (1 - config.hold_floor) * np.exp(-(below**2))

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from capture4d.body import PosedBody, ShapedBody, pose_frame, with_shape
 from capture4d.body_anny import load_anny
+from capture4d.motion_retarget import pose_sequence
 from capture4d.records import load_rig, save_body, save_garment, save_poses, save_rig
 from capture4d.scans import (
     Capture,
@@ -32,14 +33,28 @@ from data_synth.cloth_quality import measure_cloth
 from data_synth.config import FABRICS, SynthConfig
 from data_synth.motions import make_motion
 from data_synth.outfits import OUTFITS, Outfit
-from data_synth.patterns import PanelMesh, Pattern, locate, mesh_pattern, tshirt_pattern
+from data_synth.patterns import PanelMesh, Pattern, grade, locate, mesh_pattern, tshirt_pattern
 from data_synth.rig import bounding_sphere, scanner_rig
 from data_synth.scanner import LABEL_BODY, LABEL_GARMENT, Surface, scan_surfaces
 from data_synth.simulation import approach_poses, dress, simulate
 from data_synth.template import bind_template, carry
 from data_synth.wrinkle_relaxation import WrinkleMesh, relax_frame, wrinkle_mesh
 
-__all__ = ["Take", "prepare_take", "run", "simulate_take", "take_rig", "take_surfaces"]
+__all__ = [
+    "Take",
+    "finish_take",
+    "open_take",
+    "prepare_take",
+    "run",
+    "scan_frame",
+    "scan_jobs",
+    "simulate_clip",
+    "simulate_take",
+    "simulated_frames",
+    "simulation_jobs",
+    "take_rig",
+    "take_surfaces",
+]
 
 SCHEMA = 1
 BORDER_BAND_M = 0.009
@@ -77,9 +92,16 @@ def prepare_take(config: SynthConfig) -> Take:
         name: np.random.default_rng([config.seed, number])
         for number, name in enumerate(("motion", "coarse", "fine", "template", "imperfection"))
     }
-    shaped = with_shape(load_anny(), np.array(config.body_shape, np.float32))
+    if config.motion.seed:
+        streams["motion"] = np.random.default_rng([config.seed, 0, config.motion.seed])
+    shaped = _person(config.body_shape)
     simulated = (config.frames - 1) * config.capture_every + 1
-    motion = make_motion(shaped, config.motion, config.simulation.fps, simulated, streams["motion"])
+    drafted = shaped if config.drafted_for is None else _person(config.drafted_for)
+    motion = make_motion(drafted, config.motion, config.simulation.fps, simulated, streams["motion"])
+    if config.drafted_for is not None:  # who wears the graded garment moves as who wore the first
+        motion = pose_sequence(
+            shaped, motion.rotations.astype(np.float64), motion.fps, motion.translations.astype(np.float64)
+        )
     kept = slice(None, None, config.capture_every)
     poses = PoseSequence(
         motion.rotations[kept],
@@ -91,19 +113,30 @@ def prepare_take(config: SynthConfig) -> Take:
     )
     clip = [pose_frame(shaped, motion, index) for index in range(simulated)]
     pattern = tshirt_pattern(shaped, config.style)
-    coarse = mesh_pattern(pattern, config.simulation.vertices, streams["coarse"])
-    fine = mesh_pattern(pattern, config.relaxation.vertices, streams["fine"])
+    counts = {
+        "coarse": config.simulation.vertices,
+        "fine": config.relaxation.vertices,
+        "template": config.template_vertices,
+    }
+    first = tshirt_pattern(drafted, config.style)
+    meshes = {name: mesh_pattern(first, count, streams[name]) for name, count in counts.items()}
+    if config.drafted_for is not None:
+        meshes = {name: grade(mesh, first, pattern) for name, mesh in meshes.items()}
     return Take(
         config=config,
         shaped=shaped,
         poses=poses,
         bodies=approach_poses(shaped, motion, config.simulation) + clip,
         pattern=pattern,
-        coarse=coarse,
-        fine=fine,
-        template=mesh_pattern(pattern, config.template_vertices, streams["template"]),
-        wrinkles=wrinkle_mesh(coarse, fine, config.relaxation, streams["imperfection"]),
+        coarse=meshes["coarse"],
+        fine=meshes["fine"],
+        template=meshes["template"],
+        wrinkles=wrinkle_mesh(meshes["coarse"], meshes["fine"], config.relaxation, streams["imperfection"]),
     )
+
+
+def _person(shape: tuple[float, ...]) -> ShapedBody:
+    return with_shape(load_anny(), np.array(shape, np.float32))
 
 
 def run(output: Path, config: SynthConfig, *, workers: int = 2, overwrite: bool = False) -> str:
@@ -111,24 +144,66 @@ def run(output: Path, config: SynthConfig, *, workers: int = 2, overwrite: bool 
 
     Simulation is sequential and starts over when it was interrupted; scans are made in parallel and kept.
     """
-    stage = open_stage(output, name="synth", schema=SCHEMA, config=config, upstream={}, overwrite=overwrite)
-    frame_ids = list(range(1, config.frames + 1))
-    if stage.pending(frame_ids, folder="truth"):
-        if not (stage.path / "cloth" / "complete.json").exists():
-            job = _SimulationJob(stage, config)
-            list(
-                run_jobs(
-                    _simulate,
-                    [job],
-                    workers=1,
-                    label="Simulating cloth",
-                    units=lambda _: config.frames,
-                    finished=lambda: len(list((stage.path / "cloth").glob("0*.npz"))),
-                )
-            )
-        jobs = [_ScanJob(stage, config, frame_id) for frame_id in stage.pending(frame_ids, folder="truth")]
-        list(run_jobs(_scan, jobs, workers=workers, label="Scanning"))
-    _write_quality(stage, frame_ids)
+    stage = open_take(output, config, overwrite=overwrite)
+    for _ in run_jobs(
+        simulate_clip,
+        simulation_jobs(stage, config),
+        workers=1,
+        label="Simulating cloth",
+        units=lambda _: config.frames,
+        finished=lambda: simulated_frames(stage),
+    ):
+        pass
+    for _ in run_jobs(scan_frame, scan_jobs(stage, config), workers=workers, label="Scanning"):
+        pass
+    return finish_take(stage, config)
+
+
+def open_take(output: Path, config: SynthConfig, *, overwrite: bool = False) -> Stage:
+    """The folder of a take, new or to be continued."""
+    return open_stage(output, name="synth", schema=SCHEMA, config=config, upstream={}, overwrite=overwrite)
+
+
+@dataclass(frozen=True, slots=True)
+class SimulationJob:
+    """The whole clip: a simulation is sequential."""
+
+    stage: Stage
+    config: SynthConfig
+
+
+@dataclass(frozen=True, slots=True)
+class ScanJob:
+    """One frame."""
+
+    stage: Stage
+    config: SynthConfig
+    frame_id: int
+
+
+def simulation_jobs(stage: Stage, config: SynthConfig) -> list[SimulationJob]:
+    """One, or none if the clip has been simulated."""
+    done = (stage.path / "cloth" / "complete.json").exists() or not _unscanned(stage, config)
+    return [] if done else [SimulationJob(stage, config)]
+
+
+def simulated_frames(stage: Stage) -> int:
+    """Frames of the clip that lie on disk so far."""
+    return len(list((stage.path / "cloth").glob("0*.npz")))
+
+
+def scan_jobs(stage: Stage, config: SynthConfig) -> list[ScanJob]:
+    """The frames that have not been scanned yet."""
+    return [ScanJob(stage, config, frame_id) for frame_id in _unscanned(stage, config)]
+
+
+def _unscanned(stage: Stage, config: SynthConfig) -> list[int]:
+    return stage.pending(range(1, config.frames + 1), folder="truth")
+
+
+def finish_take(stage: Stage, config: SynthConfig) -> str:
+    """Close the folder of a take whose frames are all there; its digest."""
+    _write_quality(stage, list(range(1, config.frames + 1)))
     files = [path for path in sorted(stage.path.rglob("*")) if path.is_file() and _belongs(stage, path)]
     digest = stage.finish(files)
     shutil.rmtree(stage.path / "cloth", ignore_errors=True)
@@ -138,19 +213,6 @@ def run(output: Path, config: SynthConfig, *, workers: int = 2, overwrite: bool 
 def _belongs(stage: Stage, path: Path) -> bool:
     relative = path.relative_to(stage.path)
     return relative.parts[0] != "cloth" and path.name != "stage.json" and not path.name.startswith(".")
-
-
-@dataclass(frozen=True, slots=True)
-class _SimulationJob:
-    stage: Stage
-    config: SynthConfig
-
-
-@dataclass(frozen=True, slots=True)
-class _ScanJob:
-    stage: Stage
-    config: SynthConfig
-    frame_id: int
 
 
 def simulate_take(take: Take) -> Iterator[tuple[int, np.ndarray, np.ndarray | None]]:
@@ -185,7 +247,8 @@ def simulate_take(take: Take) -> Iterator[tuple[int, np.ndarray, np.ndarray | No
             yield index, coarse, None if future is None else future.result()
 
 
-def _simulate(job: _SimulationJob) -> None:
+def simulate_clip(job: SimulationJob) -> None:
+    """Simulate a clip and write its cloth, and what no scan changes."""
     take, folder, config = prepare_take(job.config), job.stage.path, job.config
     faces = take.shaped.body.template.faces
     dressed, extent = None, []
@@ -294,7 +357,8 @@ _PREPARED: dict[SynthConfig, tuple[Take, Rig]] = {}
 """What a scanning process prepares once; a process serves one take."""
 
 
-def _scan(job: _ScanJob) -> int:
+def scan_frame(job: ScanJob) -> int:
+    """Scan a simulated frame and write its truth; its number."""
     if job.config not in _PREPARED:
         _PREPARED.clear()
         _PREPARED[job.config] = prepare_take(job.config), load_rig(job.stage.path / "rig.json")
@@ -302,15 +366,17 @@ def _scan(job: _ScanJob) -> int:
     folder, frame_id, config = job.stage.path, job.frame_id, job.config
     with np.load(folder / "cloth" / f"{frame_id:06d}.npz", allow_pickle=False) as cloth:
         fine, surface = cloth["vertices"], cloth["body"]
-    scan, labels = scan_surfaces(
-        rig,
-        take_surfaces(take, fine, surface),
-        config=config.scanner,
-        rng=np.random.default_rng([config.seed, 200, frame_id]),
-        frame_id=frame_id,
-        time_s=(frame_id - 1) / take.poses.fps,
-    )
-    write_scan(folder / "scans" / f"{frame_id:06d}.ply", scan)
+    labels = np.zeros(0, np.uint8)
+    if config.scans:
+        scan, labels = scan_surfaces(
+            rig,
+            take_surfaces(take, fine, surface),
+            config=config.scanner,
+            rng=np.random.default_rng([config.seed, 200, frame_id]),
+            frame_id=frame_id,
+            time_s=(frame_id - 1) / take.poses.fps,
+        )
+        write_scan(folder / "scans" / f"{frame_id:06d}.ply", scan)
     position = frame_id - 1
     write_truth_frame(
         folder / "truth" / f"{frame_id:06d}.npz",

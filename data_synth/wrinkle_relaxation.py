@@ -85,7 +85,7 @@ def wrinkle_mesh(coarse: PanelMesh, fine: PanelMesh, config: RelaxationConfig, r
         rest_lengths=rest_lengths.astype(np.float32),
         hinges=hinges.astype(np.int32),
         hinge_weights=weights.astype(np.float32),
-        imperfection=smooth_noise(fine.vertex_uv, config.imperfection_m, config.imperfection_width_m, rng),
+        imperfection=smooth_noise(fine.noise_uv, config.imperfection_m, config.imperfection_width_m, rng),
     )
 
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -23,8 +22,9 @@ from capture4d.body_stage import load_tracking, tracking_digest
 from capture4d.errors import InputError
 from capture4d.garment_binding import with_body_shape
 from capture4d.garment_stage import load_garment_scan
-from capture4d.scans import Capture, load_garment, read_body, read_capture, read_poses, read_template, save_garment
-from capture4d.types import Body, Garment, PoseSequence, RegisteredSequence
+from capture4d.scans import Capture, read_body, read_capture, read_poses, read_template, save_garment
+from capture4d.types import Body, Garment, PoseSequence
+from capture4d.work_folder import REGISTER, VERDICTS, stack_vertices
 from capture4d.workdir import (
     Stage,
     open_stage,
@@ -33,17 +33,15 @@ from capture4d.workdir import (
     run_jobs,
     write_bytes,
     write_json,
-    write_npy_rows,
     write_npz,
 )
 from registration.config import RegistrationConfig
 from registration.sequence import FrameResult, Mover, register_run, segments
 from registration.template import TemplateAnalysis, analyse_template
 
-__all__ = ["load_registration", "run"]
+__all__ = ["run"]
 
 SCHEMA = 1
-VERDICTS = ("good", "check", "failed")
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +77,7 @@ def run(
     upstream = {"garment": require_complete(garment_folder, "extract", command)}
     if body_folder is not None:
         upstream["body"] = tracking_digest(body_folder, capture)
-    stage = open_stage(output, name="register", schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite)
+    stage = open_stage(output, name=REGISTER, schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite)
     _analysis.cache_clear()
     garment = _template(description, body_folder)
     if description.boundary_colours and not garment.loops:
@@ -100,18 +98,6 @@ def run(
     ):  # fmt: skip
         pass
     return _collect(stage, description.frame_ids)
-
-
-def load_registration(folder: Path) -> RegisteredSequence:
-    """Read a finished registration; the vertices stay on disk until they are touched."""
-    garment = load_garment(folder / "garment.npz")
-    frame_ids = [int(path.stem) for path in sorted((folder / "frames").glob("*.npz"))]
-    residual = []
-    for frame_id in frame_ids:
-        with np.load(folder / "frames" / f"{frame_id:06d}.npz", allow_pickle=False) as arrays:
-            residual.append(arrays["residual_m"])
-    vertices = np.load(folder / "vertices.npy", mmap_mode="r", allow_pickle=False)
-    return RegisteredSequence(garment, vertices, np.array(residual, np.float32), np.array(frame_ids, np.int32))
 
 
 def _moving(capture: Capture, body_folder: Path | None) -> tuple[Body | None, PoseSequence | None]:
@@ -197,19 +183,8 @@ def _metrics_path(stage: Stage, frame_id: int) -> Path:
 
 def _collect(stage: Stage, frame_ids: tuple[int, ...]) -> str:
     """Stack the frames, gather the metrics, close the stage."""
-    _stack_vertices(stage, frame_ids)
+    stack_vertices(stage, frame_ids)
     lines = [json.dumps(read_json(_metrics_path(stage, frame_id))) for frame_id in frame_ids]
     write_bytes(stage.path / "metrics.jsonl", ("\n".join(lines) + "\n").encode())
     frames = [stage.frame_path(frame_id) for frame_id in frame_ids]
     return stage.finish([stage.path / "garment.npz", stage.path / "vertices.npy", *frames])
-
-
-def _stack_vertices(stage: Stage, frame_ids: tuple[int, ...]) -> None:
-    """Write vertices.npy frame by frame, so that memory does not grow with the take."""
-
-    def frames() -> Iterator[np.ndarray]:
-        for frame_id in frame_ids:
-            with np.load(stage.frame_path(frame_id), allow_pickle=False) as arrays:
-                yield arrays["vertices"]
-
-    write_npy_rows(stage.path / "vertices.npy", frames(), count=len(frame_ids))

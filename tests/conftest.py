@@ -10,7 +10,14 @@ import pytest
 
 _ROOT = Path(__file__).parents[1]
 # tyro puts its own placeholders into the fields of a command that are still to be given.
-_COMMANDS = ("command_options", "capture_commands", "file_commands", "stage_commands", "synthesis_commands")
+_COMMANDS = (
+    "command_options",
+    "capture_commands",
+    "file_commands",
+    "model_commands",
+    "stage_commands",
+    "synthesis_commands",
+)
 _UNCHECKED = {"capture4d.app.cli", *(f"capture4d.app.{name}" for name in _COMMANDS)}
 
 

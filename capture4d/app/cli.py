@@ -18,6 +18,7 @@ import tyro
 
 from capture4d.app.capture_commands import Calibrate, Check, CheckRig
 from capture4d.app.file_commands import ConvertBody, ConvertPoses, ConvertRig, RegisterMesh, Template
+from capture4d.app.model_commands import Animate, Fit
 from capture4d.app.stage_commands import Extract, Register, Report, Run, Track
 from capture4d.app.synthesis_commands import Demo, Scan, Synth
 from capture4d.errors import InputError
@@ -49,6 +50,8 @@ _COMMANDS: Mapping[str, Any] = {
     "register": Register,
     "run": Run,
     "report": Report,
+    "fit": Fit,
+    "animate": Animate,
     "register-mesh": RegisterMesh,
     "calibrate": Calibrate,
     "check-rig": CheckRig,
@@ -147,7 +150,7 @@ def _overview() -> str:
         [
             "usage: capture4d COMMAND ...",
             "",
-            "4D garment capture: non-rigid registration of coloured scans, and a synthetic 4D scanner.",
+            "4D garment capture: registration of coloured scans, learned garments, and a synthetic 4D scanner.",
             "",
             *lines,
             "",

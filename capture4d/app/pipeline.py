@@ -9,17 +9,37 @@ from capture4d.body_tracking_config import TrackingConfig
 from capture4d.errors import InputError
 from capture4d.workdir import read_json
 from registration.config import RegistrationConfig
+from retarget.config import AnimateConfig, FitConfig, TrainingConfig
 
-__all__ = ["broken_limits", "needs_tracking", "parse_limits", "run_all", "run_demo", "run_report"]
+__all__ = ["broken_limits", "needs_tracking", "parse_limits", "run_all", "run_demo", "run_report", "run_stages"]
 
 
-def run_demo(output: Path, *, workers: int, overwrite: bool = False) -> Path:
-    """Synthesise `output`/capture, then run everything on it, its poses left aside; the path of the report."""
+OTHER_PERSON = (1.5, 2.0)
+"""Whom the demo puts the garment on: taller and heavier than the captured subject."""
+
+
+def run_demo(output: Path, *, workers: int, overwrite: bool = False) -> tuple[Path, Path]:
+    """Synthesise `output`/capture, run everything on it, its poses left aside, learn the garment and put it on another
+    body; the paths of the two reports."""
     from data_synth.config import PRESETS
     from data_synth.stage import run as synthesise
+    from retarget.animate_stage import run as animate
+    from retarget.stage import run as fit
 
     synthesise(output / "capture", PRESETS["demo"], workers=workers, overwrite=overwrite)
-    return run_all(output / "capture", output, RegistrationConfig(), track=True, workers=workers, overwrite=overwrite)
+    report = run_all(output / "capture", output, RegistrationConfig(), track=True, workers=workers, overwrite=overwrite)
+    quick = TrainingConfig(epochs=60, patience=20)
+    fit([output], output / "retarget", FitConfig(training=quick), workers=workers, overwrite=overwrite)
+    animate(
+        output / "retarget",
+        output / "body" / "poses.npz",
+        output / "other",
+        AnimateConfig(),
+        beta=OTHER_PERSON,
+        workers=workers,
+        overwrite=overwrite,
+    )
+    return report, run_report(output / "other", workers=workers, overwrite=overwrite)
 
 
 def run_all(
@@ -37,6 +57,21 @@ def run_all(
     Args:
         track: track the body even if the capture brings poses.
     """
+    run_stages(capture, output, config, tracking=tracking, track=track, workers=workers, overwrite=overwrite)
+    return run_report(output, capture=capture, workers=workers, overwrite=overwrite)
+
+
+def run_stages(
+    capture: Path,
+    output: Path,
+    config: RegistrationConfig,
+    *,
+    tracking: TrackingConfig | None = None,
+    track: bool = False,
+    workers: int,
+    overwrite: bool = False,
+) -> None:
+    """The same without the report."""
     from capture4d.garment_stage import run as extract
     from registration.stage import run as register
 
@@ -56,7 +91,6 @@ def run_all(
         workers=workers,
         overwrite=overwrite,
     )
-    return run_report(output, capture=capture, workers=workers, overwrite=overwrite)
 
 
 def needs_tracking(capture: Path) -> bool:
@@ -69,6 +103,12 @@ def needs_tracking(capture: Path) -> bool:
 
 def run_report(work: Path, *, capture: Path | None = None, workers: int = 1, overwrite: bool = False) -> Path:
     """Draw the report of a work folder; the path of its page."""
+    from capture4d.work_folder import is_animated
+
+    if is_animated(work):
+        from capture4d.app.animation_report import run as report_animation
+
+        return report_animation(work, workers=workers, overwrite=overwrite)
     from capture4d.app.report import run as report
 
     return report(work, capture=capture, workers=workers, overwrite=overwrite)

@@ -5,7 +5,6 @@ docs/report.md defines every metric. Those against truth appear where the captur
 
 from __future__ import annotations
 
-import json
 import math
 import platform
 from collections.abc import Mapping, Sequence
@@ -20,17 +19,16 @@ import jinja2
 import numpy as np
 
 from capture4d.app.charts import Line, line_chart
-from capture4d.app.report_metrics import METRICS, VERDICTS, column, summarise, truth_measures
+from capture4d.app.report_metrics import METRICS, column, summarise, truth_measures
 from capture4d.app.report_pictures import Framing, Panel, colour_bar, draw_frame
 from capture4d.app.report_stages import Calibration, StagePictures, Tracking, calibration, draw_stages, tracking
-from capture4d.errors import InputError
 from capture4d.evaluation import correspondence_errors, material_points
 from capture4d.scans import Capture, TruthModel, read_capture, read_scan, read_truth_model, read_truth_vertices
 from capture4d.types import RegisteredSequence
+from capture4d.work_folder import VERDICTS, capture_path, load_records, load_registration
 from capture4d.workdir import open_stage, read_json, require_complete, run_jobs, write_bytes, write_json
-from registration.stage import load_registration
 
-__all__ = ["ReportConfig", "run"]
+__all__ = ["MAX_FLAGGED_ROWS", "ReportConfig", "flat", "is_current", "joined_chart", "run", "shown", "spread"]
 
 SCHEMA = 2
 MAX_FLAGGED_ROWS = 60
@@ -104,17 +102,17 @@ def run(
         InputError: the registration is unfinished, or the capture is not where it was.
     """
     folder = work / "report"
-    place = _capture_path(work) if capture is None else capture
+    place = capture_path(work) if capture is None else capture
     digest = require_complete(work / "registration", "register", f"capture4d register {place} --output {work}")
     current = {"schema": SCHEMA, "config": asdict(config), "upstream": {"registration": digest}}
-    if not overwrite and _is_current(folder, current):
+    if not overwrite and is_current(folder, current):
         return folder / "index.html"
     description = read_capture(place)
     stale = (folder / "stage.json").exists()
     stage = open_stage(
         folder, name="report", schema=SCHEMA, config=config, upstream=current["upstream"], overwrite=stale
     )
-    records = [json.loads(line) for line in (work / "registration" / "metrics.jsonl").read_text().splitlines()]
+    records = load_records(work / "registration")
     _measure_truth(work, description, records, config, workers)
     tracked = tracking(description, work)
     summary = summarise(records)
@@ -130,7 +128,7 @@ def run(
             work,
             description,
             _registered(work / "registration"),
-            _spread(len(records), config.stage_pictures),
+            spread(len(records), config.stage_pictures),
             workers=workers,
         ),
     )
@@ -172,7 +170,7 @@ def _measure_truth(
     _model.cache_clear()
     if _model(capture.path) is None:
         return
-    rows = _spread(len(records), config.truth_frames)
+    rows = spread(len(records), config.truth_frames)
     measure = partial(_measure_row, work, capture)
     for row, measures in run_jobs(measure, rows, workers=workers, label="measure against truth"):
         records[row].update(measures)
@@ -213,7 +211,7 @@ def _draw_row(
 
 def _drawn_rows(records: Sequence[Mapping[str, Any]], count: int) -> list[int]:
     """Rows spread over the take, and the flagged frame that fits worst."""
-    rows = set(_spread(len(records), count))
+    rows = set(spread(len(records), count))
     flagged = [row for row, record in enumerate(records) if record["verdict"] != "good"]
     if flagged:
         rows.add(
@@ -222,7 +220,7 @@ def _drawn_rows(records: Sequence[Mapping[str, Any]], count: int) -> list[int]:
     return sorted(rows)
 
 
-def _spread(total: int, count: int) -> list[int]:
+def spread(total: int, count: int) -> list[int]:
     return sorted({round(float(row)) for row in np.linspace(0, total - 1, min(total, count))})
 
 
@@ -253,13 +251,14 @@ def _page(
         tiles=list(_tiles(summary)),
         strip=[(verdict, len(list(group))) for verdict, group in groupby(record["verdict"] for record in records)],
         verdicts=[(verdict, count) for verdict, count in counts.items() if count],
+        flagged_columns=("fit mean, mm", "border mean, mm"),
+        pictures_note="Scan, registered template, and errors, from the front and from behind.",
         flagged=[
             {
                 "frame_id": record["frame_id"],
                 "verdict": record["verdict"],
                 "reasons": "; ".join(record["reasons"]),
-                "fit": _shown(record.get("fit_mean_mm")),
-                "border": _shown(record.get("boundary_mean_mm")),
+                "shown": [shown(record.get("fit_mean_mm")), shown(record.get("boundary_mean_mm"))],
             }
             for record in flagged[:MAX_FLAGGED_ROWS]
         ],
@@ -285,11 +284,11 @@ def _page(
             for row, panels in sorted(pictures.items())
         ],
         metrics=[
-            {"key": key, "shown": _shown(value), "unit": METRICS[key][0], "meaning": METRICS[key][2]}
+            {"key": key, "shown": shown(value), "unit": METRICS[key][0], "meaning": METRICS[key][2]}
             for key, value in summary.items()
         ],
         run=list(_run_rows(work, capture, records)),
-        settings=list(_flat(read_json(work / "registration" / "stage.json")["config"])),
+        settings=list(flat(read_json(work / "registration" / "stage.json")["config"])),
     )
 
 
@@ -321,7 +320,7 @@ def _tiles(summary: Mapping[str, float | None]) -> Sequence[dict[str, str]]:
         "cpu_s": "CPU a frame, median",
     }
     return [
-        {"name": name, "value": _shown(summary[key]), "unit": METRICS[key][0]}
+        {"name": name, "value": shown(summary[key]), "unit": METRICS[key][0]}
         for key, name in names.items()
         if key in summary
     ]
@@ -333,11 +332,11 @@ def _charts(records: Sequence[Mapping[str, Any]]) -> Sequence[dict[str, str]]:
     for title, floor, wanted in CURVES:
         lines = [Line(name, column(records, key), colour) for name, key, colour in wanted if _any(records, key)]
         if lines:
-            charts.append({"title": title, "svg": _joined_chart(frames, lines, floor)})
+            charts.append({"title": title, "svg": joined_chart(frames, lines, floor)})
     return charts
 
 
-def _joined_chart(frames: list[int], lines: list[Line], floor: float) -> str:
+def joined_chart(frames: list[int], lines: list[Line], floor: float) -> str:
     """Frames without any value are left out, so that measures taken on every n-th frame join up."""
     kept = np.flatnonzero(np.any([np.isfinite(line.values) for line in lines], axis=0))
     shorter = [Line(line.name, line.values[kept], line.colour) for line in lines]
@@ -346,7 +345,7 @@ def _joined_chart(frames: list[int], lines: list[Line], floor: float) -> str:
 
 def _caption(record: Mapping[str, Any]) -> str:
     named = {"fit": "fit_mean_mm", "border": "boundary_mean_mm", "correspondence": "correspondence_mean_mm"}
-    parts = [f"{name} {_shown(record[key])} mm" for name, key in named.items() if record.get(key) is not None]
+    parts = [f"{name} {shown(record[key])} mm" for name, key in named.items() if record.get(key) is not None]
     return " · ".join([*parts, *record["reasons"]])
 
 
@@ -372,17 +371,7 @@ def _run_rows(work: Path, capture: Capture, records: Sequence[Mapping[str, Any]]
 # --- small things ------------------------------------------------------------------------------------------------
 
 
-def _capture_path(work: Path) -> Path:
-    """Where the capture lies: as the first stage recorded it, or else inside the work folder."""
-    record = work / "garment" / "stage.json"
-    recorded = read_json(record).get("sources", {}).get("capture") if record.is_file() else None
-    for candidate in (recorded, work / "capture"):
-        if candidate is not None and (Path(candidate) / "capture.json").is_file():
-            return Path(candidate)
-    raise InputError(f"{work}: expected the capture at {recorded or work / 'capture'}, found none there")
-
-
-def _is_current(folder: Path, current: Mapping[str, Any]) -> bool:
+def is_current(folder: Path, current: Mapping[str, Any]) -> bool:
     if not all((folder / name).is_file() for name in ("stage.json", "index.html", "metrics.json")):
         return False
     record = read_json(folder / "stage.json")
@@ -393,7 +382,7 @@ def _any(records: Sequence[Mapping[str, Any]], key: str) -> bool:
     return bool(np.isfinite(column(records, key)).any())
 
 
-def _shown(value: float | None) -> str:
+def shown(value: float | None) -> str:
     if value is None or not math.isfinite(value):
         return "–"
     if value == round(value) and abs(value) < 1e6:
@@ -407,7 +396,7 @@ def _round_up(value: float) -> float:
     return next(factor * power for factor in (1, 2, 5, 10) if factor * power >= value * 0.999)
 
 
-def _flat(value: Any, prefix: str = "") -> Sequence[tuple[str, str]]:
+def flat(value: Any, prefix: str = "") -> Sequence[tuple[str, str]]:
     if not isinstance(value, dict):
         return [(prefix, str(value))]
-    return [row for key, entry in value.items() for row in _flat(entry, f"{prefix}.{key}" if prefix else key)]
+    return [row for key, entry in value.items() for row in flat(entry, f"{prefix}.{key}" if prefix else key)]

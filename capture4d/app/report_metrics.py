@@ -21,10 +21,9 @@ from capture4d.evaluation import (
 )
 from capture4d.scans import TruthModel
 from capture4d.types import RegisteredSequence
+from capture4d.work_folder import VERDICTS
 
-__all__ = ["METRICS", "VERDICTS", "column", "summarise", "truth_measures"]
-
-VERDICTS = ("good", "check", "failed")
+__all__ = ["METRICS", "column", "summarise", "truth_measures"]
 
 METRICS: Mapping[str, tuple[str, str, str]] = {
     "fit_mean_mm": ("mm", "lower", "template vertices to the scan's surface, where it has data"),

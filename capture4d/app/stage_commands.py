@@ -122,7 +122,7 @@ class Run(StageOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class Report(StageOptions):
-    """Draw the report of a registered capture, and check its metrics against limits."""
+    """Draw the report of a registered capture or an animated garment, and check its metrics against limits."""
 
     work: Annotated[Positional[Path], arg(metavar="WORK")]
     """Work folder; holds registration/ and gets report/."""

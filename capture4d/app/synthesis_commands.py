@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from capture4d.app.command_options import StageOptions
+from capture4d.errors import InputError
 from data_synth import config as synth_config
 from data_synth.scanner_config import ScanConfig
 
@@ -25,7 +26,7 @@ def _with_sensor(config: Any, sensor: Literal["depth", "stereo"] | None) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class Demo(StageOptions):
-    """Make a synthetic capture, register it, and report: the whole pipeline in minutes."""
+    """Make a synthetic capture, register it, learn the garment, put it on another body: all in minutes."""
 
     output: Path = Path("out")
     """Folder for everything, the capture included."""
@@ -33,7 +34,9 @@ class Demo(StageOptions):
     def __call__(self) -> int:
         from capture4d.app.pipeline import run_demo
 
-        print(f"report: {run_demo(self.output, workers=self.workers, overwrite=self.overwrite)}")
+        report, other = run_demo(self.output, workers=self.workers, overwrite=self.overwrite)
+        print(f"report: {report}")
+        print(f"on another body: {other}")
         return 0
 
 
@@ -43,17 +46,28 @@ class Synth(StageOptions):
 
     output: Annotated[Positional[Path], arg(metavar="OUTPUT")]
     """Capture folder to write."""
-    preset: Literal[*synth_config.PRESETS] = "demo"
-    """What the settings below start from."""
+    preset: Literal[*synth_config.PRESETS, *synth_config.TRAINING_SETS] = "demo"
+    """What the settings below start from; a training set is many takes, and has no other settings."""
     scanner: Literal["depth", "stereo"] | None = None
     """Short for --scanner.sensor."""
     config: Annotated[synth_config.SynthConfig, arg(name="")] = field(default_factory=synth_config.SynthConfig)
 
     def __call__(self) -> int:
+        if self.preset in synth_config.TRAINING_SETS:
+            return self._training_set()
         from data_synth.stage import run
 
         run(self.output, _with_sensor(self.config, self.scanner), workers=self.workers, overwrite=self.overwrite)
         print(f"capture: {self.output}")
+        return 0
+
+    def _training_set(self) -> int:
+        from data_synth.training_set import run
+
+        if self.config != synth_config.SynthConfig() or self.scanner is not None:
+            raise InputError(f"--preset {self.preset}: expected no other settings, for its takes bring their own")
+        run(self.output, synth_config.TRAINING_SETS[self.preset], workers=self.workers, overwrite=self.overwrite)
+        print(f"captures: {self.output / 'takes'}")
         return 0
 
 

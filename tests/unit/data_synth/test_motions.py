@@ -141,3 +141,24 @@ def test_a_clip_that_is_too_short_says_so(person: ShapedBody, tmp_path: Path) ->
     path = write_bvh(tmp_path / "short.bvh", [[0.0] * 6] * 9)
     with pytest.raises(InputError, match="expected at least 40 frames at 60 fps, found 5"):
         make_motion(person, MotionConfig(bvh=str(path)), 60.0, 40, np.random.default_rng(0))
+
+
+def test_a_reversed_clip_is_the_clip_from_its_end(person: ShapedBody) -> None:
+    forwards, backwards = (
+        make_motion(person, MotionConfig("twist", reverse=reverse), 60.0, 40, np.random.default_rng(0))
+        for reverse in (False, True)
+    )
+    np.testing.assert_array_equal(backwards.rotations, forwards.rotations[::-1])
+    np.testing.assert_array_equal(backwards.frame_ids, forwards.frame_ids)
+
+
+@pytest.mark.parametrize("clip", ["walk", "hop", "arm-circles", "reach-twist"])
+def test_clips_stay_on_the_floor_and_move_no_faster_than_people(person: ShapedBody, clip: str) -> None:
+    poses = make_motion(person, MotionConfig(clip), 60.0, 150, np.random.default_rng(0))
+    turned = np.swapaxes(poses.rotations[:-1], -1, -2) @ poses.rotations[1:]
+    speed = Rotation.from_matrix(turned.reshape(-1, 3, 3)).magnitude() * 60
+    assert np.degrees(speed).max() < 720
+    assert np.linalg.norm(np.diff(poses.translations, axis=0), axis=1).max() * 60 < 3.0
+    lowest = [pose_frame(person, poses, frame).vertices()[:, 1].min() for frame in range(0, 150, 10)]
+    assert -0.03 < min(lowest) < 0.03
+    assert max(lowest) < 0.35

@@ -8,7 +8,7 @@ import pytest
 from capture4d.body import ShapedBody
 from capture4d.mesh import boundary_edges, unique_edges
 from data_synth.config import GarmentStyle
-from data_synth.patterns import locate, mesh_pattern, tshirt_pattern
+from data_synth.patterns import grade, locate, mesh_pattern, tshirt_pattern
 
 
 @pytest.mark.parametrize("vertices", [600, 2500, 20_000])
@@ -86,3 +86,27 @@ def test_style_parameters_do_what_they_say(person: ShapedBody, style: GarmentSty
         return {panel.name: np.concatenate([edge.curve for edge in panel.edges]) for panel in pattern.panels}
 
     assert measure(outlines(style)) > 1.05 * measure(outlines(GarmentStyle()))
+
+
+def test_grading_to_oneself_changes_nothing(person: ShapedBody) -> None:
+    pattern = tshirt_pattern(person, GarmentStyle())
+    mesh = mesh_pattern(pattern, 800, np.random.default_rng(0))
+    same = grade(mesh, pattern, pattern)
+    np.testing.assert_allclose(same.uv, mesh.uv, atol=1e-4)
+    np.testing.assert_array_equal(same.noise_uv, mesh.vertex_uv)
+
+
+def test_a_graded_garment_is_the_larger_one_with_the_same_triangles(person: ShapedBody) -> None:
+    drafted, graded = (tshirt_pattern(person, GarmentStyle(size=size)) for size in (1.0, 1.2))
+    mesh = mesh_pattern(drafted, 1500, np.random.default_rng(0))
+    larger, own = grade(mesh, drafted, graded), mesh_pattern(graded, 1500, np.random.default_rng(0))
+    np.testing.assert_array_equal(larger.faces, mesh.faces)
+
+    def area(each) -> np.ndarray:
+        first, second = each.uv[:, 1] - each.uv[:, 0], each.uv[:, 2] - each.uv[:, 0]
+        return 0.5 * (first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
+
+    assert area(larger).min() > 0
+    assert area(larger).sum() == pytest.approx(area(own).sum(), rel=5e-3)
+    growth = area(larger) / area(mesh)
+    assert np.ptp(np.log(growth)) < 1.2  # evenly: no face grows more than three times as much as another

@@ -1,0 +1,132 @@
+"""Takes to learn a garment from, registered or as they truly were; made once, kept in the user's cache."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from capture4d.app.pipeline import run_stages
+from capture4d.body import ShapedBody, with_shape
+from capture4d.evaluation import material_points
+from capture4d.records import load_poses
+from capture4d.scans import (
+    Capture,
+    read_body,
+    read_capture,
+    read_template,
+    read_truth_model,
+    read_truth_vertices,
+)
+from capture4d.types import Garment, PoseSequence, RegisteredSequence
+from capture4d.work_folder import load_moving_body, load_records, load_registration
+from data_synth.cached_takes import cached_training_set
+from data_synth.config import TRAINING_SETS, TrainingSetConfig
+from registration.config import RegistrationConfig
+from retarget.learning import Take, UnposedTakes
+from retarget.pose_normalisation import PoseRows, unpose_sequence
+from retarget.splits import Piece, Role
+
+__all__ = ["Lesson", "lesson", "training_set", "true_places", "true_take"]
+
+UNSEEN_WEIGHT = 0.05
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lesson:
+    """Everything to learn from and to be examined on."""
+
+    takes: UnposedTakes
+    pieces: tuple[Piece, ...]
+    """Training and validation clips; the held-out ones have the role "held out"."""
+    reversed: tuple[Piece, ...]
+    """The clips that run backwards, as if they were held out."""
+    garment: Garment
+    person: ShapedBody
+
+
+def training_set(*, quick: bool, workers: int) -> tuple[TrainingSetConfig, Path]:
+    """The set and its folder; made if this machine has not made it before."""
+    config = TRAINING_SETS["tiny-train" if quick else "tshirt-train"]
+    return config, cached_training_set(config, workers=workers)
+
+
+def lesson(config: TrainingSetConfig, folder: Path, *, truth: bool, tracked: bool, workers: int) -> Lesson:
+    """The takes of a set.
+
+    Args:
+        truth: the template's true places instead of its registrations.
+        tracked: register with the body that was tracked, not with the poses of the capture.
+    """
+    names = list(config.takes)
+    sequences = []
+    for name in names:
+        capture = read_capture(folder / "takes" / name)
+        if truth:
+            sequences.append(true_take(capture))
+        else:
+            work = folder / "works" / name
+            run_stages(capture.path, work, RegistrationConfig(), track=tracked, workers=workers)
+            body, poses = load_moving_body(work)
+            good = np.array([record["verdict"] == "good" for record in load_records(work / "registration")])
+            sequences.append((load_registration(work / "registration"), with_shape(body, poses.shape), poses, good))
+    person = np.mean([poses.shape for _, _, poses, _ in sequences], axis=0).astype(np.float32)
+    takes, frames, weights = [], [], []
+    for name, (registered, shaped, poses, good) in zip(names, sequences, strict=True):
+        rows = PoseRows.match(registered, shaped, poses)
+        for rest, weight in unpose_sequence(registered, rows, person, unseen_weight=UNSEEN_WEIGHT):
+            frames.append(rest)
+            weights.append(weight)
+        transforms = np.stack([rows.transforms(row) for row in range(len(good))])
+        takes.append(Take(name, rows.poses, good, transforms))
+    registered, shaped, _, _ = sequences[0]
+    skin_weights = registered.garment.skin_weights
+    assert skin_weights is not None
+    unposed = UnposedTakes(takes, np.stack(frames), np.stack(weights), skin_weights)
+    pieces = [Piece(take, range(len(each.good)), _role(names[take], config, names)) for take, each in enumerate(takes)]
+    backwards = tuple(piece for piece in pieces if names[piece.take] in config.reversed)
+    return Lesson(
+        unposed,
+        tuple(piece for piece in pieces if piece not in backwards),
+        backwards,
+        replace(registered.garment, body_shape=person),
+        with_shape(shaped.body, person),
+    )
+
+
+def _role(name: str, config: TrainingSetConfig, names: Sequence[str]) -> Role:
+    """The last clip that is learned from validates."""
+    if name in config.held_out or name in config.reversed:
+        return "held out"
+    learned = [each for each in names if each not in config.held_out and each not in config.reversed]
+    return "validation" if name == learned[-1] else "training"
+
+
+def true_take(capture: Capture) -> tuple[RegisteredSequence, ShapedBody, PoseSequence, np.ndarray]:
+    """A take as if it had been registered without any error, with its exact poses."""
+    body, poses = read_body(capture), load_poses(capture.path / "truth" / "poses.npz")
+    assert body is not None
+    places = true_places(capture)
+    registered = RegisteredSequence(
+        read_template(capture), places, np.zeros(places.shape[:2], np.float32), np.array(capture.frame_ids, np.int32)
+    )
+    return registered, with_shape(body, poses.shape), poses, np.ones(len(places), bool)
+
+
+def true_places(capture: Capture) -> np.ndarray:
+    """(T, V, 3) float32: where the template's material points truly are, metres."""
+    model = read_truth_model(capture)
+    assert model is not None
+    return np.stack(
+        [
+            material_points(
+                read_truth_vertices(capture, frame_id),
+                model.fine.faces,
+                model.template_faces,
+                model.template_barycentric,
+            )
+            for frame_id in capture.frame_ids
+        ]
+    )

@@ -1,0 +1,103 @@
+"""A work folder from outside: its registered sequence, and the body and poses that moved the template.
+
+registration/garment.npz, frames/000123.npz and vertices.npy are read by every stage after registration, whoever wrote
+them: registration itself, or an animated model.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from capture4d.body_anny import load_anny
+from capture4d.body_stage import load_tracking
+from capture4d.errors import InputError
+from capture4d.records import load_garment
+from capture4d.scans import read_body, read_capture, read_poses
+from capture4d.types import Body, PoseSequence, RegisteredSequence
+from capture4d.workdir import Stage, read_json, write_npy_rows
+
+__all__ = [
+    "ANIMATE",
+    "REGISTER",
+    "VERDICTS",
+    "capture_path",
+    "is_animated",
+    "load_moving_body",
+    "load_records",
+    "load_registration",
+    "stack_vertices",
+]
+
+VERDICTS = ("good", "check", "failed")
+"""What a frame's file holds as a number."""
+REGISTER, ANIMATE = "register", "animate"
+"""Stages that write a registered sequence."""
+
+
+def load_registration(folder: Path) -> RegisteredSequence:
+    """Read a finished WORK/registration; the vertices stay on disk until they are touched."""
+    garment = load_garment(folder / "garment.npz")
+    frame_ids = [int(path.stem) for path in sorted((folder / "frames").glob("*.npz"))]
+    residual = []
+    for frame_id in frame_ids:
+        with np.load(folder / "frames" / f"{frame_id:06d}.npz", allow_pickle=False) as arrays:
+            residual.append(arrays["residual_m"])
+    vertices = np.load(folder / "vertices.npy", mmap_mode="r", allow_pickle=False)
+    return RegisteredSequence(garment, vertices, np.array(residual, np.float32), np.array(frame_ids, np.int32))
+
+
+def stack_vertices(stage: Stage, frame_ids: Sequence[int]) -> None:
+    """Write vertices.npy from the frames, one by one, so that memory does not grow with the take."""
+
+    def frames() -> Iterator[np.ndarray]:
+        for frame_id in frame_ids:
+            with np.load(stage.frame_path(frame_id), allow_pickle=False) as arrays:
+                yield arrays["vertices"]
+
+    write_npy_rows(stage.path / "vertices.npy", frames(), count=len(frame_ids))
+
+
+def load_records(folder: Path) -> list[dict[str, Any]]:
+    """The frames' measures and verdicts, from WORK/registration/metrics.jsonl."""
+    return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+
+
+def is_animated(work: Path) -> bool:
+    """Whether the sequence comes from a model, not from scans."""
+    record = work / "registration" / "stage.json"
+    return record.is_file() and read_json(record).get("stage") == ANIMATE
+
+
+def capture_path(work: Path) -> Path:
+    """Where the capture lies: as the first stage recorded it, or else inside the work folder.
+
+    Raises:
+        InputError: it is in neither place.
+    """
+    record = work / "garment" / "stage.json"
+    recorded = read_json(record).get("sources", {}).get("capture") if record.is_file() else None
+    for candidate in (recorded, work / "capture"):
+        if candidate is not None and (Path(candidate) / "capture.json").is_file():
+            return Path(candidate)
+    raise InputError(f"{work}: expected the capture at {recorded or work / 'capture'}, found none there")
+
+
+def load_moving_body(work: Path) -> tuple[Body, PoseSequence]:
+    """The body and the poses with which a take was registered: those that were tracked, or those of its capture.
+
+    Raises:
+        InputError: there are none.
+    """
+    upstream = read_json(work / "registration" / "stage.json").get("upstream", {})
+    if "body" in upstream or is_animated(work):
+        return load_tracking(work / "body")
+    capture = read_capture(capture_path(work))
+    poses = read_poses(capture)
+    if poses is None:
+        raise InputError(f"{work}: expected poses in {capture.path}, found none; track the body and register again")
+    return read_body(capture) or load_anny(), poses

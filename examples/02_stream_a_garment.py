@@ -1,0 +1,47 @@
+"""Drive a learned garment frame by frame, as a game or a live preview would, and write one mesh a frame.
+
+    capture4d fit WORK --output SHIRT
+    python examples/02_stream_a_garment.py SHIRT poses.npz MESHES
+
+The poses are at the model's frame rate. Nothing here looks ahead: the numbers are those of `capture4d animate --mean
+captured --removal.no-enabled`.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from capture4d.body import skin, with_pose
+from capture4d.mesh_files import write_mesh
+from capture4d.records import load_poses
+from retarget.blendshapes import reconstruct
+from retarget.bodies import captured_person
+from retarget.controls import ControlStream
+from retarget.stage import load_garment_model
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("model", type=Path)
+    parser.add_argument("poses", type=Path)
+    parser.add_argument("meshes", type=Path)
+    options = parser.parse_args()
+
+    known = load_garment_model(options.model)
+    model, person = known.model, captured_person(known.model, known.body)
+    regressor = known.linear if known.lstm is None else known.lstm
+    controls, answers = ControlStream(regressor.layout), regressor.stream()
+    poses = load_poses(options.poses)
+    regressor.layout.require(poses)
+    for rotations, translation, frame_id in zip(poses.rotations, poses.translations, poses.frame_ids, strict=True):
+        coefficients = answers.push(controls.push(rotations, translation, float(frame_id) / poses.fps))
+        rest = reconstruct(model.mean, model.basis, coefficients[None])[0]
+        vertices = skin(rest, model.garment.skin_weights, with_pose(person, rotations, translation).transforms)
+        mesh = model.garment.template.with_vertices(vertices.astype("float32"))
+        write_mesh(options.meshes / f"{int(frame_id):06d}.ply", mesh)
+    print(f"{len(poses.frame_ids)} meshes: {options.meshes}")
+
+
+if __name__ == "__main__":
+    main()

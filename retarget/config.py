@@ -1,0 +1,154 @@
+"""Settings of the garment model. Standard library only, so that the command line can list them at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class ShapeConfig:
+    """The statistical model: mean and principal directions of the unposed garment."""
+
+    components: int = 0
+    """How many directions to keep; 0: the fewest with which no vertex of a training frame is off by more than
+    `max_error_mm`."""
+    max_error_mm: float = 5.0
+    """Worst vertex of the worst training frame, in the pose (the paper's 5 mm at 500 directions)."""
+    most_components: int = 500
+    """No more than so many, whatever the error."""
+    method: Literal["auto", "exact", "randomised"] = "auto"
+    """How directions are found; `auto` is exact up to `memory_mb`."""
+    memory_mb: float = 1500.0
+    """Larger takes are read block by block."""
+    unseen_weight: float = 0.05
+    """Weight of a vertex without scan data, beside 1 for one with: registration guessed it."""
+    filling_rounds: int = 6
+    """How often unseen vertices are filled in from the model and the model learned again."""
+
+
+@dataclass(frozen=True)
+class SplitConfig:
+    """Which clips are learned from, and which decide. Clips are never cut between neighbouring frames."""
+
+    validation: tuple[str, ...] = ()
+    """Takes to validate on, by the name of their work folder; chosen at random if absent."""
+    held_out: tuple[str, ...] = ()
+    """Takes that learning never sees."""
+    validation_share: float = 0.15
+    """Part of the frames to validate on."""
+    gap_s: float = 0.5
+    """Seconds left out on both sides of a cut, where one take has to be cut because it is the only one."""
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class ControlConfig:
+    """What drives the garment: by default the paper's control vector."""
+
+    joint_share: float = 0.004
+    """A joint belongs to the garment if it carries this share of its skin weights."""
+    root_motion: bool = True
+    """Velocity and acceleration of the root, in the root's frame."""
+    derivative_frames: int = 5
+    """Frames, the present one and those before, through which a parabola is laid for them; 3 are plain differences,
+    more are less noisy."""
+    up: bool = False
+    """The direction of gravity in the root's frame as well."""
+    joint_velocity: bool = False
+    """Angular velocities of the garment's joints and of the root as well."""
+    history: int = 0
+    """Coefficients of so many frames before, as predicted (the autoregressive variant)."""
+
+
+@dataclass(frozen=True)
+class LinearConfig:
+    """Linear regression from control vectors to coefficients."""
+
+    fit: Literal["ridge", "moore-penrose"] = "ridge"
+    """Least squares with an intercept, or F = L T^+ as the paper prints it, without."""
+    ridges: tuple[float, ...] = (0.0, 1e-4, 1e-3, 1e-2, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
+    """Penalties to choose from on the validation clips, relative to the mean variance of the controls."""
+
+
+@dataclass(frozen=True)
+class LstmConfig:
+    """The sequence-to-sequence network: encoder and decoder of the same size."""
+
+    layers: int = 4
+    size: int = 256
+    window: int = 3
+    """Frames in and frames out."""
+    over_linear: bool = False
+    """Learn what the linear regression leaves, instead of the whole."""
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """One training run."""
+
+    epochs: int = 400
+    batch: int = 64
+    learning_rate: float = 1e-3
+    weight_decay: float = 0.0
+    teacher_forcing: float = 0.0
+    """Probability that a step of the decoder is given the true coefficients of the step before, not its own."""
+    loss: Literal["coefficients", "whitened"] = "coefficients"
+    """Squared error of the coefficients, as it is measured, or of the whitened ones, in which the last direction counts
+    as much as the first."""
+    clip_gradient: float = 1.0
+    """Largest norm of a gradient."""
+    patience: int = 40
+    """Epochs without improvement on the validation clips after which to stop."""
+    checkpoint_s: float = 30.0
+    """Seconds between checkpoints; they change nothing in the result."""
+    threads: int = 1
+    """Threads of torch; results are the same bits only for the same number."""
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """Learning a garment."""
+
+    licence: str = ""
+    """A note on who may use the model, kept in its file."""
+    regressor: Literal["both", "linear"] = "both"
+    """Leave the LSTM out with `linear`."""
+    shape: ShapeConfig = field(default_factory=ShapeConfig)
+    split: SplitConfig = field(default_factory=SplitConfig)
+    control: ControlConfig = field(default_factory=ControlConfig)
+    linear: LinearConfig = field(default_factory=LinearConfig)
+    lstm: LstmConfig = field(default_factory=LstmConfig)
+    training: TrainingConfig = field(default_factory=TrainingConfig)
+
+
+@dataclass(frozen=True)
+class RemovalConfig:
+    """Taking the garment out of the body."""
+
+    enabled: bool = True
+    margin_mm: float = 2.0
+    """How far outside the body its vertices are put."""
+    stay: float = 1.0
+    """Weight of staying in place, for the vertices that are outside (1 in TailorNet's code)."""
+    leave: float = 4.0
+    """Weight of reaching the outside, for those that are not (4 in TailorNet's code); each round doubles it."""
+    rounds: int = 6
+    """Searches for vertices inside; what is left is moved straight out."""
+    faces: bool = True
+    """Also where the body pokes through a face of the garment whose corners are all outside."""
+
+
+@dataclass(frozen=True)
+class AnimateConfig:
+    """Putting a learned garment on a motion and a body."""
+
+    regressor: Literal["auto", "lstm", "linear"] = "auto"
+    """`auto`: the LSTM if the model has one."""
+    mean: Literal["corrected", "printed", "captured"] = "corrected"
+    """How the mean meets another body: moved by the difference of the two bodies (Eq. 5, corrected), by the new body's
+    whole offset from the average person (as printed), or not at all."""
+    unlike_deg: float = 10.0
+    """A pose farther than this from every training pose is reported, unless the model was validated farther away."""
+    removal: RemovalConfig = field(default_factory=RemovalConfig)

@@ -1,0 +1,143 @@
+"""What drives the garment: the control vector of each frame.
+
+Rotations of the garment's joints relative to their parents, as the first two columns of R - I (6 numbers a joint), and
+velocity (m/s) and acceleration (m/s^2) of the root in the root's frame. The past alone decides, so that a frame can be
+answered as it comes: derivatives are those of a parabola through the present frame and a few before.
+
+References: DeepWrinkles (ECCV 2018), section 3.3. Zhou et al., On the Continuity of Rotation Representations (CVPR
+2019), for six numbers a rotation.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64, Int32
+from scipy.spatial.transform import Rotation
+
+from capture4d.errors import InputError
+from capture4d.types import PoseSequence
+from retarget.config import ControlConfig
+
+__all__ = ["ControlLayout", "ControlStream", "control_vectors", "garment_joints"]
+
+RATE_TOLERANCE = 1e-3
+"""Relative difference of two frame rates that are the same."""
+
+
+def garment_joints(
+    skin_weights: Float[np.ndarray, "verts joints"], parents: Int32[np.ndarray, " joints"], share: float
+) -> tuple[int, ...]:
+    """Joints that carry at least a share of the garment's weights, and those between them and the root; no root.
+
+    A joint in between bends the garment without carrying it, where the skeleton has it split in two.
+    """
+    carried = skin_weights.sum(axis=0) / max(float(skin_weights.sum()), 1e-12)
+    found = set()
+    for joint in np.flatnonzero(carried >= share):
+        above = int(joint)
+        while above > 0:
+            found.add(above)
+            above = int(parents[above])
+    return tuple(sorted(found))
+
+
+@dataclass(frozen=True, slots=True)
+class ControlLayout:
+    """What stands in a control vector, in which units and at which rate; part of every learned regressor."""
+
+    joint_names: tuple[str, ...]
+    """Of the whole skeleton."""
+    joints: tuple[int, ...]
+    """The garment's."""
+    fps: float
+    config: ControlConfig
+
+    @property
+    def size(self) -> int:
+        """Numbers of a control vector, without the history."""
+        joints = len(self.joints)
+        motion = 6 if self.config.root_motion else 0
+        return 6 * joints + motion + 3 * self.config.up + 3 * (joints + 1) * self.config.joint_velocity
+
+    def require(self, poses: PoseSequence) -> None:
+        """
+        Raises:
+            InputError: the poses are of another skeleton or rate.
+        """
+        if poses.joint_names != self.joint_names:
+            raise InputError(
+                f"poses: expected the {len(self.joint_names)} joints of the model ({', '.join(self.joint_names[:4])}, "
+                f"...), found {len(poses.joint_names)} ({', '.join(poses.joint_names[:4])}, ...)"
+            )
+        if abs(poses.fps - self.fps) > RATE_TOLERANCE * self.fps:
+            raise InputError(f"poses: expected {self.fps:g} frames a second, as the model, found {poses.fps:g}")
+
+
+class ControlStream:
+    """Control vectors of frames as they come."""
+
+    def __init__(self, layout: ControlLayout) -> None:
+        self._layout = layout
+        self._past: deque[tuple[float, np.ndarray]] = deque(maxlen=layout.config.derivative_frames)
+        self._before: tuple[float, np.ndarray] | None = None
+
+    def push(
+        self, rotations: Float[np.ndarray, "joints 3 3"], translation: Float[np.ndarray, " 3"], time_s: float
+    ) -> Float64[np.ndarray, " controls"]:
+        """The control vector of the next frame.
+
+        Args:
+            time_s: any clock that frames share; a missing frame is a longer step.
+        """
+        config, joints = self._layout.config, list(self._layout.joints)
+        local = rotations.astype(np.float64)
+        self._past.append((time_s, translation.astype(np.float64)))
+        parts = [(local[joints] - np.eye(3))[:, :, :2].reshape(-1)]
+        if config.root_motion:
+            velocity, acceleration = _derivatives(self._past)
+            parts += [local[0].T @ velocity, local[0].T @ acceleration]
+        if config.up:
+            parts.append(local[0].T @ np.array([0.0, 1.0, 0.0]))
+        if config.joint_velocity:
+            parts.append(self._turning(local[[0, *joints]], time_s))
+        return np.concatenate(parts)
+
+    def _turning(self, local: np.ndarray, time_s: float) -> np.ndarray:
+        """Angular velocities since the frame before, radians a second, in each joint's own frame."""
+        before, self._before = self._before, (time_s, local)
+        if before is None:
+            return np.zeros(3 * len(local))
+        turned = np.swapaxes(before[1], 1, 2) @ local
+        return (Rotation.from_matrix(turned).as_rotvec() / max(time_s - before[0], 1e-9)).reshape(-1)
+
+
+def _derivatives(past: deque[tuple[float, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Velocity and acceleration at the last place, from a line through two or a parabola through more."""
+    if len(past) < 2:
+        return np.zeros(3), np.zeros(3)
+    times = np.array([time - past[-1][0] for time, _ in past])
+    scale = -times[0]
+    degree = min(len(past) - 1, 2)
+    terms = (times / scale)[:, None] ** np.arange(degree + 1)
+    fitted = np.linalg.lstsq(terms, np.stack([place for _, place in past]), rcond=None)[0]
+    acceleration = 2 * fitted[2] / scale**2 if degree == 2 else np.zeros(3)
+    return fitted[1] / scale, acceleration
+
+
+def control_vectors(layout: ControlLayout, poses: PoseSequence) -> Float32[np.ndarray, "frames controls"]:
+    """Control vectors of a motion.
+
+    Raises:
+        InputError: the poses are of another skeleton or rate.
+    """
+    layout.require(poses)
+    stream = ControlStream(layout)
+    times = poses.frame_ids / poses.fps
+    rows = [
+        stream.push(rotations, translation, float(time))
+        for rotations, translation, time in zip(poses.rotations, poses.translations, times, strict=True)
+    ]
+    return np.array(rows, np.float32).reshape(len(rows), layout.size)

@@ -1,0 +1,161 @@
+"""From control vectors to blendshape coefficients: what every regressor has in common, and its file.
+
+A regressor answers frame by frame (`stream`), and a whole motion at once (`predict`), with the same numbers. Controls
+are standardised and coefficients whitened inside; outside they are in their own units.
+
+Letters: T frames, D controls (with the history), K coefficients.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from capture4d.errors import InputError
+from capture4d.tensor_files import TensorFile, read_tensors, write_tensors
+from retarget.config import ControlConfig
+from retarget.controls import ControlLayout
+
+__all__ = ["Clip", "History", "Regressor", "Scales", "Stream", "read_regressor", "with_history", "write_regressor"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Clip:
+    """Consecutive frames to learn from or to be measured on."""
+
+    controls: Float32[np.ndarray, "frames controls"]
+    coefficients: Float32[np.ndarray, "frames shapes"]
+    good: np.ndarray
+    """(T,) bool: frames whose coefficients are known; the others only lead up to them."""
+
+
+@runtime_checkable
+class Stream(Protocol):
+    """Frames of one motion, as they come."""
+
+    def push(self, controls: Float[np.ndarray, " controls"]) -> Float32[np.ndarray, " shapes"]:
+        """The coefficients of the next frame."""
+        ...
+
+
+@runtime_checkable
+class Regressor(Protocol):
+    """A learned map from motion to coefficients."""
+
+    @property
+    def layout(self) -> ControlLayout: ...
+
+    def stream(self) -> Stream:
+        """Start a motion."""
+        ...
+
+    def predict(self, controls: Float32[np.ndarray, "frames controls"]) -> Float32[np.ndarray, "frames shapes"]:
+        """The coefficients of a whole motion."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scales:
+    """How controls are standardised and coefficients whitened."""
+
+    control_mean: Float32[np.ndarray, " controls"]
+    control_std: Float32[np.ndarray, " controls"]
+    std: Float32[np.ndarray, " shapes"]
+
+    @staticmethod
+    def of(controls: Float[np.ndarray, "frames controls"], std: Float[np.ndarray, " shapes"]) -> Scales:
+        """Controls that hardly move are left as small as they are, not blown up."""
+        spread = controls.std(axis=0)
+        floor = max(1e-3 * float(spread.max(initial=0.0)), 1e-6)
+        whole = np.asarray(std, np.float32)
+        return Scales(
+            controls.mean(axis=0).astype(np.float32),
+            np.maximum(spread, floor).astype(np.float32),
+            np.maximum(whole, np.float32(1e-6) * whole.max(initial=np.float32(1e-6))),
+        )
+
+    def standardised(self, controls: Float[np.ndarray, "*frames controls"]) -> Float32[np.ndarray, "*frames controls"]:
+        return ((controls - self.control_mean) / self.control_std).astype(np.float32)
+
+    def whitened(self, coefficients: Float[np.ndarray, "*frames shapes"]) -> Float32[np.ndarray, "*frames shapes"]:
+        return (coefficients / self.std).astype(np.float32)
+
+
+class History:
+    """The coefficients of a few frames before, whitened, latest first; zeros before a motion begins."""
+
+    def __init__(self, frames: int, shapes: int) -> None:
+        self._past = np.zeros((frames, shapes), np.float32)
+
+    def extend(self, controls: Float[np.ndarray, " controls"]) -> Float32[np.ndarray, " all"]:
+        """Controls with the history behind them."""
+        return np.concatenate([np.asarray(controls, np.float32), self._past.reshape(-1)])
+
+    def push(self, whitened: Float[np.ndarray, " shapes"]) -> None:
+        """Take in the frame that has just been answered."""
+        if len(self._past):
+            self._past = np.concatenate([np.asarray(whitened, np.float32)[None], self._past[:-1]])
+
+
+def with_history(clip: Clip, frames: int, std: Float32[np.ndarray, " shapes"]) -> Clip:
+    """A clip whose controls hold the true coefficients of the frames before: how an autoregressive model learns."""
+    if frames == 0:
+        return clip
+    whitened = np.where(clip.good[:, None], clip.coefficients / std, 0).astype(np.float32)
+    past = [np.concatenate([np.zeros_like(whitened[:step]), whitened[:-step]]) for step in range(1, frames + 1)]
+    past = [each[: len(whitened)] for each in past]
+    return Clip(np.concatenate([clip.controls, *past], axis=1), clip.coefficients, clip.good)
+
+
+# --- files -------------------------------------------------------------------------------------------------------
+
+
+def write_regressor(
+    path: Path,
+    kind: str,
+    tensors: Mapping[str, np.ndarray],
+    *,
+    layout: ControlLayout,
+    scales: Scales,
+    model_digest: str,
+    note: Mapping[str, Any],
+) -> None:
+    """Write a regressor with what its controls are and which model its coefficients belong to."""
+    everything = {
+        "control_mean": scales.control_mean,
+        "control_std": scales.control_std,
+        "coefficient_std": scales.std,
+        **tensors,
+    }
+    write_tensors(path, kind, everything, {"layout": asdict(layout), "model": model_digest, **note})
+
+
+def read_regressor(path: Path, kind: str, *, model_digest: str) -> tuple[TensorFile, ControlLayout, Scales]:
+    """
+    Raises:
+        InputError: the file is damaged, another kind, or belongs to another model.
+    """
+    file = read_tensors(path, kind)
+    if file.entry("model") != model_digest:
+        raise InputError(f"{path}: expected a regressor of the blendshapes beside it, found one of another model")
+    for name, array in file.tensors.items():
+        if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
+            raise InputError(f"{path}: expected finite numbers, found NaN or inf in '{name}'")
+    return file, _load_layout(file), Scales(file["control_mean"], file["control_std"], file["coefficient_std"])
+
+
+def _load_layout(file: TensorFile) -> ControlLayout:
+    """The layout in a file's note."""
+    entry = dict(file.entry("layout"))
+    try:
+        config = ControlConfig(**entry.pop("config"))
+        return ControlLayout(
+            tuple(entry["joint_names"]), tuple(int(joint) for joint in entry["joints"]), float(entry["fps"]), config
+        )
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{file.path}: damaged description of the controls ({error})") from None

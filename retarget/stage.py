@@ -1,0 +1,351 @@
+"""The stage that learns a garment: registered work folders in, WORK/retarget out.
+
+stage.json                 what was run
+body.npz                   the body that moved the garment
+takes/NAME.json            verdicts of the frames that were unposed; done when it is there
+blendshapes.safetensors    the model, with template, weights, borders, licence
+linear.safetensors         regression from controls to coefficients
+lstm.safetensors           the same by the network
+poses.safetensors          the poses it was learned from
+checkpoints/ metrics.jsonl of the training
+fit.json                   what was learned from, how many directions, and the errors
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from capture4d.blendshape_files import load_blendshapes, save_blendshapes
+from capture4d.body import with_shape
+from capture4d.errors import InputError
+from capture4d.garment_binding import with_body_shape
+from capture4d.records import load_body, load_garment, save_body
+from capture4d.types import BlendshapeModel, Body, PoseSequence
+from capture4d.work_folder import load_moving_body, load_records, load_registration
+from capture4d.workdir import (
+    Stage,
+    file_digest,
+    open_stage,
+    read_json,
+    require_complete,
+    run_jobs,
+    write_json,
+    write_npy,
+    write_npy_rows,
+)
+from retarget.blendshapes import ShapeSpace, as_model_arrays, shape_space, worst_errors
+from retarget.config import FitConfig
+from retarget.controls import ControlLayout, garment_joints
+from retarget.learning import (
+    Take,
+    UnposedTakes,
+    learn_shapes,
+    predictions,
+    regression_clips,
+    training_poses,
+    vertex_error_m,
+)
+from retarget.linear import LinearRegressor, fit_linear, load_linear, mean_squared_error, save_linear
+from retarget.pose_normalisation import PoseRows, unpose_sequence
+from retarget.pose_range import PoseRange, load_pose_range, save_pose_range
+from retarget.regressors import Clip, Regressor
+from retarget.splits import ROLES, Piece, Role, split_takes
+
+__all__ = ["GarmentModel", "load_garment_model", "run"]
+
+SCHEMA = 1
+MODEL, LINEAR, LSTM, POSES = (f"{name}.safetensors" for name in ("blendshapes", "linear", "lstm", "poses"))
+
+
+def run(
+    works: Sequence[Path],
+    output: Path,
+    config: FitConfig,
+    *,
+    device: str = "cpu",
+    workers: int = 1,
+    overwrite: bool = False,
+) -> str:
+    """Learn a garment from registered takes; the digest of the result.
+
+    Args:
+        works: work folders, each with a finished registration/. Their names are the takes' names.
+        device: of the training.
+    Raises:
+        InputError: a registration is missing, takes do not fit together, or there are too few good frames.
+    """
+    names = [work.resolve().name for work in works]
+    if len(set(names)) != len(names):
+        raise InputError(f"takes: expected work folders of different names, found {', '.join(sorted(names))}")
+    upstream = {
+        name: require_complete(work / "registration", "register", f"capture4d run CAPTURE --output {work}")
+        for name, work in zip(names, works, strict=True)
+    }
+    stage = open_stage(output, name="fit", schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite)
+    if (output / "fit.json").is_file():  # the last file of a run
+        return _finish(stage)
+    body, moving = _moving_bodies(works)
+    person = np.mean([poses.shape for poses in moving], axis=0).astype(np.float32)
+    if not (output / "body.npz").is_file():
+        save_body(output / "body.npz", body)
+    unpose = partial(_unpose_take, stage.path, config.shape.unseen_weight, person)
+    jobs = [_UnposeJob(name, work) for name, work in zip(names, works, strict=True)
+            if not (stage.path / "takes" / f"{name}.json").is_file()]  # fmt: skip
+    for _ in run_jobs(unpose, jobs, workers=workers, label="unpose"):
+        pass
+    takes = _stacked(stage, works, names, body, moving)
+    pieces = split_takes(names, [len(take.good) for take in takes.takes], takes.takes[0].poses.fps, config.split)
+    model, shape_note = _blendshapes(stage, works, takes, pieces, body, person, config)
+    layout = ControlLayout(
+        body.joint_names,
+        garment_joints(takes.skin_weights, body.parents, config.control.joint_share),
+        takes.takes[0].poses.fps,
+        config.control,
+    )
+    known = training_poses(takes, pieces, layout)
+    save_pose_range(output / POSES, known, model_digest=_digest(output))
+    note = shape_note | _regressors(stage, takes, pieces, layout, shape_space(model), config, device)
+    split = {role: [_piece_name(names, piece) for piece in pieces if piece.role == role]
+             for role in ROLES}  # fmt: skip
+    write_json(output / "fit.json", {"split": split, "validated_deg": known.validated_deg, **note})
+    return _finish(stage)
+
+
+def _finish(stage: Stage) -> str:
+    files = [stage.path / name for name in ("body.npz", MODEL, LINEAR, LSTM, POSES)]
+    digest = stage.finish([path for path in files if path.is_file()])
+    shutil.rmtree(stage.path / "unposed", ignore_errors=True)
+    return digest
+
+
+def _piece_name(names: Sequence[str], piece: Piece) -> str:
+    return f"{names[piece.take]}[{piece.frames.start}:{piece.frames.stop}]"
+
+
+# --- takes -------------------------------------------------------------------------------------------------------
+
+
+def _moving_bodies(works: Sequence[Path]) -> tuple[Body, list[PoseSequence]]:
+    """The one body of all takes, and the poses of each."""
+    found = [load_moving_body(work) for work in works]
+    body, first = found[0]
+    template = load_garment(works[0] / "registration" / "garment.npz").template
+    for work, (other, poses) in zip(works, found, strict=True):
+        if other.joint_names != body.joint_names or not np.array_equal(other.template.faces, body.template.faces):
+            raise InputError(f"{work}: expected the body of {works[0]}, found another skeleton or mesh")
+        if abs(poses.fps - first.fps) > 1e-3 * first.fps:
+            raise InputError(f"{work}: expected {first.fps:g} frames a second as in {works[0]}, found {poses.fps:g}")
+        if len(poses.shape) != len(first.shape):
+            raise InputError(f"{work}: expected {len(first.shape)} shape coefficients, found {len(poses.shape)}")
+        garment = load_garment(work / "registration" / "garment.npz")
+        if not np.array_equal(garment.template.faces, template.faces):
+            raise InputError(
+                f"{work}: expected the template of {works[0]} ({len(template.vertices)} vertices, "
+                f"{len(template.faces)} faces), found one of {len(garment.template.vertices)} and "
+                f"{len(garment.template.faces)}"
+            )
+    return body, [poses for _, poses in found]
+
+
+@dataclass(frozen=True, slots=True)
+class _UnposeJob:
+    name: str
+    work: Path
+
+
+def _unpose_take(output: Path, unseen_weight: float, person: np.ndarray, job: _UnposeJob) -> None:
+    """Write a take's frames in the rest pose, on the person whom all takes share."""
+    registered = load_registration(job.work / "registration")
+    body, poses = load_moving_body(job.work)
+    rows = PoseRows.match(registered, with_shape(body, poses.shape), poses)
+    weights = []
+
+    def frames() -> Iterator[np.ndarray]:
+        for rest, weight in unpose_sequence(registered, rows, person, unseen_weight=unseen_weight):
+            weights.append(weight)
+            yield rest
+
+    folder = output / "unposed"
+    write_npy_rows(folder / f"{job.name}.vertices.npy", frames(), count=len(registered.frame_ids))
+    write_npy(folder / f"{job.name}.weights.npy", np.stack(weights))
+    verdicts = [record["verdict"] for record in load_records(job.work / "registration")]
+    write_json(output / "takes" / f"{job.name}.json", {"frames": registered.frame_ids, "verdicts": verdicts})
+
+
+def _stacked(
+    stage: Stage, works: Sequence[Path], names: Sequence[str], body: Body, moving: Sequence[PoseSequence]
+) -> UnposedTakes:
+    """All takes' frames in one array on disk."""
+    folder = stage.path / "unposed"
+    parts = [np.load(folder / f"{name}.vertices.npy", mmap_mode="r", allow_pickle=False) for name in names]
+    path = folder / "all.npy"
+    if not path.is_file():
+        write_npy_rows(path, (row for part in parts for row in part), count=sum(map(len, parts)))
+    takes, skin_weights = [], load_garment(works[0] / "registration" / "garment.npz").skin_weights
+    assert skin_weights is not None
+    for name, work, poses in zip(names, works, moving, strict=True):
+        rows = PoseRows.match(load_registration(work / "registration"), with_shape(body, poses.shape), poses)
+        verdicts = read_json(stage.path / "takes" / f"{name}.json")["verdicts"]
+        transforms = np.stack([rows.transforms(row) for row in range(len(verdicts))])
+        takes.append(Take(name, rows.poses, np.array([each == "good" for each in verdicts]), transforms))
+    good = int(sum(take.good.sum() for take in takes))
+    if good < 2:
+        frames = sum(len(take.good) for take in takes)
+        raise InputError(f"takes: expected at least 2 good frames to learn from, found {good} of {frames}")
+    return UnposedTakes(
+        takes,
+        np.load(path, mmap_mode="r", allow_pickle=False),
+        np.concatenate([np.load(folder / f"{name}.weights.npy", allow_pickle=False) for name in names]),
+        skin_weights,
+    )
+
+
+# --- learning ----------------------------------------------------------------------------------------------------
+
+
+def _blendshapes(
+    stage: Stage,
+    works: Sequence[Path],
+    takes: UnposedTakes,
+    pieces: Sequence[Piece],
+    body: Body,
+    person: np.ndarray,
+    config: FitConfig,
+) -> tuple[BlendshapeModel, dict[str, Any]]:
+    """Learn the shape space, unless an earlier run has."""
+    path, note_path = stage.path / MODEL, stage.path / "shapes.json"
+    if path.is_file() and note_path.is_file():
+        return load_blendshapes(path), read_json(note_path)
+    space, fewest = learn_shapes(takes, pieces, config.shape)
+    garment = with_body_shape(load_garment(works[0] / "registration" / "garment.npz"), body, person)
+    mean, basis, std = as_model_arrays(space)
+    model = BlendshapeModel(
+        replace(garment, body_shape=person), mean, basis, std, body.joint_names, takes.takes[0].poses.fps,
+        config.licence or "none given",
+    )  # fmt: skip
+    save_blendshapes(path, model)
+    note: dict[str, Any] = {"directions": len(std), "directions_for_max_error": fewest}
+    for role in ROLES:
+        rows = takes.rows(pieces, role)
+        if len(rows):
+            mean_m, worst_m = _errors(takes, rows, space)
+            note[f"{role.replace(' ', '_')}_frames"] = len(rows)
+            note[f"{role.replace(' ', '_')}_shape_error_mm"] = {"mean": 1e3 * mean_m, "worst": 1e3 * worst_m}
+    write_json(note_path, note)
+    return model, note
+
+
+def _errors(takes: UnposedTakes, rows: np.ndarray, space: ShapeSpace) -> tuple[float, float]:
+    count = len(space.std)
+    return worst_errors(
+        space, takes.vertices, takes.weights, rows, takes.transforms, takes.skin_weights, [count]
+    )[count]  # fmt: skip
+
+
+def _regressors(
+    stage: Stage,
+    takes: UnposedTakes,
+    pieces: Sequence[Piece],
+    layout: ControlLayout,
+    space: ShapeSpace,
+    config: FitConfig,
+    device: str,
+) -> dict[str, Any]:
+    """Learn what is not there yet, and measure all of it."""
+    digest = _digest(stage.path)
+    clips = {role: regression_clips(takes, pieces, role, layout, space) for role in ROLES}
+    linear = fit_linear(clips["training"], clips["validation"], layout, space.std, config.linear)
+    save_linear(stage.path / LINEAR, linear, model_digest=digest)
+    regressors: dict[str, Regressor] = {"linear": linear}
+    if config.regressor == "both":
+        regressors["lstm"] = _network(stage, clips, layout, space, linear, config, device, digest)
+    note: dict[str, Any] = {"control_numbers": layout.size, "joints": [layout.joint_names[j] for j in layout.joints]}
+    for name, regressor in regressors.items():
+        note[name] = {} if name == "lstm" else {"ridge": linear.ridge}
+        for role, known in clips.items():
+            if known:
+                error = vertex_error_m(takes, pieces, role, space, predictions(regressor, known))
+                note[name][role.replace(" ", "_")] = {
+                    "coefficient_mse_mm2": 1e6 * mean_squared_error(regressor, known),
+                    "vertex_error_mm": 1e3 * error,
+                }
+    return note
+
+
+def _network(
+    stage: Stage,
+    clips: Mapping[Role, Sequence[Clip]],
+    layout: ControlLayout,
+    space: ShapeSpace,
+    linear: LinearRegressor,
+    config: FitConfig,
+    device: str,
+    digest: str,
+) -> Regressor:
+    # torch takes a second to load
+    from retarget.lstm import load_lstm, save_lstm
+    from retarget.training import train_lstm
+
+    path = stage.path / LSTM
+    if not path.is_file():
+        found = train_lstm(
+            clips["training"], clips["validation"], layout, space.std, stage.path,
+            lstm=config.lstm, config=config.training, linear=linear, device=device,
+        )  # fmt: skip
+        save_lstm(path, found, model_digest=digest)
+    return load_lstm(path, model_digest=digest, linear=linear)
+
+
+def _digest(folder: Path) -> str:
+    return file_digest([folder / MODEL], root=folder)
+
+
+# --- reading -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GarmentModel:
+    """A learned garment, ready to be moved."""
+
+    folder: Path
+    model: BlendshapeModel
+    body: Body
+    linear: LinearRegressor
+    lstm: Regressor | None
+    poses: PoseRange
+    digest: str
+    """Of the blendshapes' file."""
+
+
+def load_garment_model(path: Path, *, device: str = "cpu", with_lstm: bool = True) -> GarmentModel:
+    """Read what `run` wrote.
+
+    Args:
+        path: WORK/retarget, WORK, or the blendshapes.safetensors in it.
+    Raises:
+        InputError: a file is missing, damaged, or belongs to another model.
+    """
+    folder = path.parent if path.is_file() else path / "retarget" if (path / "retarget").is_dir() else path
+    if path.is_file() and path.name != MODEL:
+        raise InputError(f"{path}: expected {MODEL} or the folder that holds it, found another file")
+    if not (folder / MODEL).is_file():
+        raise InputError(f"{folder}: expected a model ({MODEL}), found none; run: capture4d fit WORK")
+    model = load_blendshapes(folder / MODEL)
+    digest = _digest(folder)
+    linear = load_linear(folder / LINEAR, model_digest=digest)
+    if len(linear.intercept) != len(model.std):
+        raise InputError(f"{folder / LINEAR}: expected {len(model.std)} coefficients, found {len(linear.intercept)}")
+    lstm = None
+    if with_lstm and (folder / LSTM).is_file():
+        from retarget.lstm import load_lstm
+
+        lstm = load_lstm(folder / LSTM, model_digest=digest, linear=linear, device=device)
+    known = load_pose_range(folder / POSES, model_digest=digest)
+    return GarmentModel(folder, model, load_body(folder / "body.npz"), linear, lstm, known, digest)

@@ -1,0 +1,274 @@
+"""Linear regression and the network: exactness, parameter counts, streaming, drift, resuming."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from capture4d.errors import InputError
+from capture4d.types import PoseSequence
+from capture4d.workdir import write_bytes
+from retarget.config import ControlConfig, LinearConfig, LstmConfig, TrainingConfig
+from retarget.controls import ControlLayout, control_vectors
+from retarget.linear import fit_linear, load_linear, mean_squared_error, save_linear
+from retarget.lstm import EncoderDecoder, LstmRegressor, load_lstm, save_lstm
+from retarget.regressors import Clip
+from retarget.training import train_lstm
+
+NAMES = ("root", "middle", "top")
+SMALL = LstmConfig(layers=2, size=24)
+QUICK = TrainingConfig(epochs=6, batch=16, patience=10)
+
+
+def layout(**settings) -> ControlLayout:
+    return ControlLayout(NAMES, (1, 2), 60.0, ControlConfig(**settings))
+
+
+@pytest.fixture
+def clips(motion, make_world):
+    """Clips of a world whose garment lags behind; the last validates."""
+
+    def make(lag: float = 3.0, frames: int = 60, count: int = 4, chosen: ControlLayout | None = None) -> list[Clip]:
+        world, layout_ = make_world(lag), chosen or layout()
+        found = []
+        for seed in range(count):
+            poses = motion(frames, seed)
+            wanted = world.coefficients(poses).astype(np.float32)
+            found.append(Clip(control_vectors(layout_, poses), wanted, np.ones(frames, bool)))
+        return found
+
+    return make
+
+
+def spread(clips: list[Clip]) -> np.ndarray:
+    return np.concatenate([clip.coefficients for clip in clips]).std(axis=0)
+
+
+def test_a_linear_garment_is_found_exactly() -> None:
+    rng = np.random.default_rng(0)
+    chosen = layout()
+    matrix, intercept = rng.standard_normal((chosen.size, 3)), rng.standard_normal(3)
+    controls = rng.standard_normal((80, chosen.size)).astype(np.float32)
+    clip = Clip(controls, (controls @ matrix + intercept).astype(np.float32), np.ones(80, bool))
+    found = fit_linear([clip], [clip], chosen, spread([clip]), LinearConfig())
+    assert found.ridge == 0.0
+    np.testing.assert_allclose(found.predict(controls), clip.coefficients, atol=1e-4)
+    printed = fit_linear([clip], [clip], chosen, spread([clip]), LinearConfig(fit="moore-penrose"))
+    slow = clip.coefficients.T @ np.linalg.pinv(controls.T.astype(float))
+    np.testing.assert_allclose(printed.predict(controls), controls @ slow.T, atol=1e-3)
+    assert mean_squared_error(printed, [clip]) > 100 * mean_squared_error(found, [clip])  # it has no intercept
+
+
+def test_the_ridge_is_the_one_that_validates_best_and_bad_frames_do_not_count(clips) -> None:
+    known = clips(frames=14)
+    spoilt = Clip(known[0].controls, known[0].coefficients.copy(), known[0].good.copy())
+    spoilt.coefficients[5], spoilt.good[5] = 1e3, False
+    chosen, config = layout(), LinearConfig()
+    found = fit_linear([spoilt], known[2:], chosen, spread(known), config)
+    errors = {
+        ridge: mean_squared_error(
+            fit_linear([spoilt], [], chosen, spread(known), LinearConfig(ridges=(ridge,))), known[2:]
+        )
+        for ridge in config.ridges
+    }
+    assert errors[found.ridge] == min(errors.values())
+    assert found.ridge > 0
+    assert min(errors.values()) < 1.0
+
+
+def test_the_paper_s_network_has_as_many_numbers_as_counted() -> None:
+    network = EncoderDecoder(60, 500, LstmConfig())
+
+    def size(module: torch.nn.Module) -> int:
+        return sum(each.numel() for each in module.parameters())
+
+    assert (size(network.encoder), size(network.decoder), size(network.head)) == (1_904_640, 2_355_200, 128_500)
+
+
+@pytest.mark.parametrize("history", [0, 2])
+@pytest.mark.parametrize("kind", ["linear", "lstm", "over linear"])
+def test_streaming_equals_batch(clips, kind: str, history: int, tmp_path: Path) -> None:
+    chosen = layout(history=history)
+    known = clips(chosen=chosen)
+    found = linear = fit_linear(known[:3], known[3:], chosen, spread(known), LinearConfig(ridges=(0.1,)))
+    if kind != "linear":
+        config = LstmConfig(layers=2, size=16, over_linear=kind == "over linear")
+        training = TrainingConfig(epochs=2)
+        found = train_lstm(
+            known[:3], known[3:], chosen, spread(known), tmp_path, lstm=config, config=training, linear=linear
+        )
+    whole = found.predict(known[3].controls)
+    stream = found.stream()
+    again = np.stack([stream.push(row) for row in known[3].controls])
+    np.testing.assert_allclose(again, whole, atol=1e-5 * np.abs(whole).max())
+
+
+def test_running_freely_does_not_drift(clips, tmp_path: Path) -> None:
+    """The same second of motion over and over gives the same answers at the end as at the start."""
+    for history in (0, 2):
+        chosen = layout(history=history)
+        known = clips(chosen=chosen)
+        linear = fit_linear(known[:3], known[3:], chosen, spread(known), LinearConfig())
+        network = train_lstm(
+            known[:3], known[3:], chosen, spread(known), tmp_path / str(history), lstm=SMALL, config=QUICK
+        )
+        loop = np.tile(known[3].controls[:50], (20, 1))
+        for regressor in (linear, network):
+            said = regressor.predict(loop).reshape(20, 50, -1)
+            np.testing.assert_allclose(said[-1], said[2], atol=0.02 * np.abs(said).max())
+
+
+def bending(frames: int, seed: int) -> Clip:
+    """One joint that bends to and fro; the garment folds the same way on either side, which no line can say."""
+    phase, rate = np.random.default_rng(seed).uniform(1, 3, 2)
+    angle = np.sin(phase + rate * np.arange(frames) / 20)
+    rotations = np.tile(np.eye(3, dtype=np.float32), (frames, 3, 1, 1))
+    rotations[:, 1] = Rotation.from_euler("z", angle[:, None]).as_matrix()
+    still, shape = np.zeros((frames, 3), np.float32), np.zeros(2, np.float32)
+    poses = PoseSequence(rotations, still, shape, np.arange(frames, dtype=np.int32), 60.0, NAMES)
+    wanted = np.stack([np.abs(angle), 0.3 * np.cos(3 * angle)], axis=1)
+    return Clip(control_vectors(layout(), poses), wanted.astype(np.float32), np.ones(frames, bool))
+
+
+def test_the_network_learns_what_a_line_cannot(tmp_path: Path) -> None:
+    known = [bending(80, seed) for seed in range(4)]
+    linear = fit_linear(known[:3], known[3:], layout(), spread(known), LinearConfig())
+    network = train_lstm(
+        known[:3], known[3:], layout(), spread(known), tmp_path,
+        lstm=LstmConfig(layers=1, size=32), config=TrainingConfig(epochs=30, batch=16, learning_rate=1e-2),
+    )  # fmt: skip
+    backwards = Clip(known[3].controls[::-1].copy(), known[3].coefficients[::-1].copy(), known[3].good)
+    for clip in (known[3], backwards):
+        assert mean_squared_error(network, [clip]) < 0.65 * mean_squared_error(linear, [clip])
+
+
+def test_training_stops_early_and_keeps_the_best(clips, tmp_path: Path) -> None:
+    known = clips(frames=20, count=2)
+    noise = Clip(known[1].controls, -known[1].coefficients, known[1].good)
+    config = TrainingConfig(epochs=200, patience=3, learning_rate=5e-3)
+    found = train_lstm(known[:1], [noise], layout(), spread(known), tmp_path, lstm=SMALL, config=config)
+    lines = (tmp_path / "metrics.jsonl").read_text().splitlines()
+    assert len(lines) < 200
+    errors = [json.loads(line)["validation_mse_mm2"] for line in lines]
+    assert 1e6 * mean_squared_error(found, [noise]) == pytest.approx(min(errors))
+
+
+def weights(regressor: LstmRegressor) -> dict[str, bytes]:
+    return {name: each.numpy().tobytes() for name, each in regressor.network.state_dict().items()}
+
+
+def test_a_run_that_stopped_anywhere_ends_with_the_same_bits(clips, tmp_path: Path, monkeypatch) -> None:
+    known = clips(count=3)
+    config = TrainingConfig(epochs=5, batch=16, checkpoint_s=0.0, teacher_forcing=0.5)
+
+    def go(folder: Path) -> LstmRegressor:
+        return train_lstm(known[:2], known[2:], layout(), spread(known), folder, lstm=SMALL, config=config)
+
+    whole = go(tmp_path / "whole")
+    step = torch.optim.Adam.step
+    done = 0
+
+    def stop_after(limit: int):
+        def counted(self, *arguments):
+            nonlocal done
+            done += 1
+            if done > limit:
+                raise KeyboardInterrupt
+            return step(self, *arguments)
+
+        return counted
+
+    for limit in (3, 12, 20):  # three stops of one run
+        done = 0
+        monkeypatch.setattr(torch.optim.Adam, "step", stop_after(limit))
+        with pytest.raises(KeyboardInterrupt):
+            go(tmp_path / "stopped")
+        torch.manual_seed(limit)  # whatever happens in between
+    monkeypatch.setattr(torch.optim.Adam, "step", step)
+    assert weights(go(tmp_path / "stopped")) == weights(whole)
+    assert (tmp_path / "stopped" / "metrics.jsonl").read_bytes() == (tmp_path / "whole" / "metrics.jsonl").read_bytes()
+
+
+TRAIN = """
+import sys, pathlib, numpy as np
+from retarget.config import *
+from retarget.controls import ControlLayout
+from retarget.regressors import Clip
+from retarget.training import train_lstm
+from retarget.lstm import save_lstm
+rng = np.random.default_rng(0)
+layout = ControlLayout(("root", "a"), (1,), 60.0, ControlConfig())
+controls = rng.standard_normal((400, layout.size)).astype(np.float32)
+clip = Clip(controls, np.sin(controls[:, :3]), np.ones(400, bool))
+found = train_lstm([clip], [clip], layout, np.ones(3), pathlib.Path(sys.argv[1]), lstm=LstmConfig(layers=2, size=32),
+                   config=TrainingConfig(epochs=12, batch=8, checkpoint_s=0.05))
+save_lstm(pathlib.Path(sys.argv[1]) / "done.safetensors", found, model_digest="x")
+"""
+
+
+@pytest.mark.slow
+def test_a_killed_run_ends_with_the_same_bits(tmp_path: Path) -> None:
+    def start(folder: str) -> subprocess.Popen:
+        return subprocess.Popen([sys.executable, "-c", TRAIN, str(tmp_path / folder)], cwd=Path(__file__).parents[3])
+
+    assert start("whole").wait() == 0
+    for kill in range(3):
+        process = start("killed")
+        checkpoint = tmp_path / "killed" / "checkpoints" / "last.safetensors"
+        waited = time.monotonic() + 120
+        before = checkpoint.stat().st_mtime_ns if checkpoint.is_file() else 0
+        while time.monotonic() < waited and process.poll() is None:
+            if checkpoint.is_file() and checkpoint.stat().st_mtime_ns > before:
+                break
+            time.sleep(0.01)
+        time.sleep(0.05 * kill)
+        if process.poll() is None:
+            os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+    assert start("killed").wait() == 0
+    assert (tmp_path / "killed" / "done.safetensors").read_bytes() == (
+        tmp_path / "whole" / "done.safetensors"
+    ).read_bytes()
+
+
+def test_files_come_back_as_they_were_and_wrong_ones_are_one_line(clips, tmp_path: Path) -> None:
+    known, chosen = clips(count=2), layout(up=True)
+    known = clips(count=2, chosen=chosen)
+    linear = fit_linear(known[:1], known[1:], chosen, spread(known), LinearConfig())
+    config = LstmConfig(layers=1, size=8, over_linear=True)
+    network = train_lstm(
+        known[:1], known[1:], chosen, spread(known), tmp_path, lstm=config, config=QUICK, linear=linear
+    )
+    save_linear(tmp_path / "linear.safetensors", linear, model_digest="m")
+    save_lstm(tmp_path / "lstm.safetensors", network, model_digest="m")
+    again = load_linear(tmp_path / "linear.safetensors", model_digest="m")
+    assert again.layout == chosen
+    np.testing.assert_array_equal(again.predict(known[1].controls), linear.predict(known[1].controls))
+    back = load_lstm(tmp_path / "lstm.safetensors", model_digest="m", linear=again)
+    np.testing.assert_array_equal(back.predict(known[1].controls), network.predict(known[1].controls))
+    with pytest.raises(InputError, match="of another model"):
+        load_linear(tmp_path / "linear.safetensors", model_digest="other")
+    with pytest.raises(InputError, match="expected capture4d lstm regressor, found capture4d linear"):
+        load_lstm(tmp_path / "linear.safetensors", model_digest="m")
+    with pytest.raises(InputError, match="beside it, found none"):
+        load_lstm(tmp_path / "lstm.safetensors", model_digest="m")
+    write_bytes(tmp_path / "cut.safetensors", (tmp_path / "lstm.safetensors").read_bytes()[:-100])
+    with pytest.raises(InputError, match=r"cut\.safetensors: not a readable safetensors file"):
+        load_lstm(tmp_path / "cut.safetensors", model_digest="m")
+    torch.save({}, tmp_path / "lstm.pt")
+    with pytest.raises(InputError, match="found a pickle or an archive"):
+        load_lstm(tmp_path / "lstm.pt", model_digest="m")
+
+
+def test_an_unknown_device_is_one_line(clips, tmp_path: Path) -> None:
+    known = clips(count=2)
+    with pytest.raises(InputError, match="device: expected one that torch can use"):
+        train_lstm(known[:1], known[1:], layout(), spread(known), tmp_path, lstm=SMALL, config=QUICK, device="nonsense")

@@ -1,0 +1,278 @@
+"""Fit and animate from the command line: what comes out, resuming, and what is wrong in one line."""
+
+import pickle
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from capture4d.app.cli import main
+from capture4d.blendshape_files import load_blendshapes
+from capture4d.body import pose_frame, skin, with_shape
+from capture4d.errors import InputError
+from capture4d.records import load_body, save_body, save_garment, save_poses
+from capture4d.tensor_files import read_tensors, write_tensors
+from capture4d.work_folder import load_moving_body, load_records, load_registration
+from capture4d.workdir import read_json
+from retarget.config import SplitConfig
+from retarget.splits import split_takes
+
+QUICK = (
+    "--shape.max-error-mm",
+    "0.1",
+    "--lstm.layers",
+    "1",
+    "--lstm.size",
+    "16",
+    "--training.epochs",
+    "3",
+    "--workers",
+    "1",
+)
+
+
+def run(*arguments: str | Path) -> int:
+    with pytest.raises(SystemExit) as exit_:
+        main([str(argument) for argument in arguments])
+    return int(exit_.value.code or 0)
+
+
+def fails(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
+    """Run a command that must fail on its input; the one line it says."""
+    capsys.readouterr()
+    assert run(*arguments) == 1
+    said = capsys.readouterr().err.strip()
+    assert said.splitlines()[-1].startswith("capture4d: ")
+    assert "Traceback" not in said
+    return said.splitlines()[-1]
+
+
+@pytest.fixture(scope="module")
+def works(write_work, motion, make_world, tmp_path_factory) -> list[Path]:
+    world, folder = make_world(waves=3), tmp_path_factory.mktemp("works")
+    return [write_work(folder / f"take{seed}", motion(16, seed), world=world, flagged=(4,)) for seed in range(3)]
+
+
+@pytest.fixture(scope="module")
+def learned(works, tmp_path_factory) -> Path:
+    output = tmp_path_factory.mktemp("fit") / "learned"
+    assert run("fit", *works, "--output", output, "--split.validation", "take2", "--licence", "CC0", *QUICK) == 0
+    return output
+
+
+@pytest.fixture
+def model(learned: Path, tmp_path: Path) -> Path:
+    """A copy, to be spoilt."""
+    shutil.copytree(learned, tmp_path / "learned")
+    return tmp_path / "learned" / "retarget"
+
+
+def animate(model: Path, poses: Path, output: Path, *more: str | Path) -> tuple[str | Path, ...]:
+    return "animate", model, "--poses", poses, "--output", output, "--workers", "1", *more
+
+
+def test_fit_finds_the_waves_and_says_so(model: Path, works, make_world) -> None:
+    note, learned = read_json(model / "fit.json"), load_blendshapes(model / "blendshapes.safetensors")
+    assert note["split"] == {
+        "training": ["take0[0:16]", "take1[0:16]"], "validation": ["take2[0:16]"], "held out": []
+    }  # fmt: skip
+    assert note["training_frames"] == 30  # one of each take is flagged, and 5 m away
+    assert note["directions"] == note["directions_for_max_error"] == 3
+    assert note["validation_shape_error_mm"]["worst"] < 0.5
+    assert learned.licence == "CC0"
+    assert list(learned.garment.loops) == ["hem", "neck"]
+    assert learned.garment.template.uv is not None
+    waves = make_world(waves=3).waves.reshape(3, -1)
+    for direction in learned.basis.reshape(len(learned.basis), -1):
+        assert np.linalg.norm(waves @ direction) > 0.999
+    assert note["linear"]["training"]["vertex_error_mm"] < 2.0
+    assert note["lstm"]["validation"]["vertex_error_mm"] > 0
+    assert (model / "metrics.jsonl").read_text().count("\n") == 3
+    assert not (model / "unposed").exists()
+
+
+def test_fit_again_changes_nothing_and_other_settings_are_refused(model: Path, works, capsys) -> None:
+    again = ("fit", *works, "--output", model.parent, "--split.validation", "take2", "--licence", "CC0")
+    before = {path.name: path.read_bytes() for path in model.glob("*.safetensors")}
+    digest = read_json(model / "stage.json")["digest"]
+    assert run(*again, *QUICK) == 0
+    assert {path.name: path.read_bytes() for path in model.glob("*.safetensors")} == before
+    assert read_json(model / "stage.json")["digest"] == digest
+    assert "other settings" in fails(capsys, *again, *QUICK, "--shape.components", "2")
+
+
+def test_the_captured_motion_on_the_captured_person_is_the_capture(model: Path, works, tmp_path: Path) -> None:
+    output = tmp_path / "again"
+    poses = works[0] / "body" / "poses.npz"
+    assert run(*animate(model, poses, output, "--regressor", "linear", "--removal.no-enabled")) == 0
+    found, wanted = (load_registration(each / "registration") for each in (output, works[0]))
+    good = np.delete(np.arange(16), 4)
+    apart = np.linalg.norm(found.vertices[good] - wanted.vertices[good], axis=-1)
+    assert apart.mean() < 0.004
+    assert np.isnan(found.residual_m).all()
+    body, motion = load_moving_body(output)
+    assert len(motion.frame_ids) == 16
+    assert body.joint_names == motion.joint_names
+
+
+def test_another_person_gets_the_garment_outside_the_body(model: Path, works, tmp_path: Path, capsys) -> None:
+    output = tmp_path / "thick"
+    poses = works[2] / "body" / "poses.npz"
+    assert run(*animate(model, poses, output, "--beta", "3", "1", "--mean", "captured")) == 0
+    records = load_records(output / "registration")
+    assert (
+        np.mean([record["inside_before_percent"] for record in records]) > 10
+    )  # a thick limb in a tube that did not grow
+    assert np.mean([record["inside_body_percent"] for record in records]) <= 0.3
+    corrected = tmp_path / "corrected"
+    assert run(*animate(model, poses, corrected, "--beta", "3", "1")) == 0
+    body, motion = load_moving_body(corrected)
+    person = with_shape(body, motion.shape)
+    np.testing.assert_allclose(motion.shape, [3, 1])
+    garment = load_registration(corrected / "registration").garment
+    posed = skin(garment.template.vertices, garment.skin_weights, pose_frame(person, motion, 0).transforms)
+    assert np.linalg.norm(load_registration(corrected / "registration").vertices[0] - posed, axis=1).mean() < 0.02
+    # and the report works on it, with limits
+    capsys.readouterr()
+    assert run("report", output, "--workers", "1", "--fail-above", "inside_body_percent=0.3") == 0
+    page = (output / "report" / "index.html").read_text()
+    assert "is inside the body" in page
+    assert page.count("data:image/webp") >= 8
+    assert run("report", output, "--workers", "1", "--fail-above", "inside_before_percent=0.3") == 1
+
+
+def test_an_interrupted_animation_is_finished_by_the_same_command(model: Path, works, tmp_path: Path) -> None:
+    poses, output = works[1] / "body" / "poses.npz", tmp_path / "out"
+    assert run(*animate(model, poses, output)) == 0
+    digest = read_json(output / "registration" / "stage.json")["digest"]
+    for path in sorted((output / "registration" / "frames").glob("*.npz"))[5:9]:
+        path.unlink()
+    (output / "registration" / "coefficients.npy").unlink()
+    assert run(*animate(model, poses, output)) == 0
+    assert read_json(output / "registration" / "stage.json")["digest"] == digest
+
+
+def test_unlike_poses_are_flagged(model: Path, works, motion, tmp_path: Path) -> None:
+    poses = motion(6, 9)
+    twisted = poses.rotations.copy()
+    twisted[3:, 1] = twisted[3:, 1] @ np.diag([-1, 1, -1]).astype(np.float32)  # half a turn
+    save_poses(tmp_path / "odd.npz", replace(poses, rotations=twisted))
+    assert run(*animate(model, tmp_path / "odd.npz", tmp_path / "odd", "--unlike-deg", "40")) == 0
+    records = load_records(tmp_path / "odd" / "registration")
+    assert [record["verdict"] for record in records[3:]] == ["check"] * 3
+    assert "deg from every pose that was learned" in records[3]["reasons"][0]
+    assert records[0]["pose_distance_deg"] < 40
+
+
+def test_a_motion_at_another_rate_is_resampled(model: Path, motion, tmp_path: Path) -> None:
+    save_poses(tmp_path / "slow.npz", replace(motion(10, 1), fps=30.0))
+    assert run(*animate(model, tmp_path / "slow.npz", tmp_path / "slow")) == 0
+    motion_ = load_moving_body(tmp_path / "slow")[1]
+    assert motion_.fps == 60.0
+    assert len(motion_.frame_ids) == 19
+
+
+# --- what is wrong
+
+
+def test_takes_that_do_not_fit_together_are_one_line(works, write_work, motion, make_world, tmp_path, capsys) -> None:
+    world = make_world()
+    faces = world.garment.template.faces[:-1].copy()
+    template = replace(world.garment.template, faces=faces, uv=None)
+    other = write_work(tmp_path / "other", motion(10, 7))
+    save_garment(other / "registration" / "garment.npz", replace(world.garment, template=template))
+    line = fails(capsys, "fit", *works, other, "--output", tmp_path / "x", *QUICK)
+    assert "other: expected the template of" in line
+    slow = write_work(tmp_path / "slow", replace(motion(10, 7), fps=30.0))
+    assert "expected 60 frames a second" in fails(capsys, "fit", *works, slow, "--output", tmp_path / "y", *QUICK)
+    assert "--output: expected" in fails(capsys, "fit", *works)
+    assert "found take0, take0" in fails(capsys, "fit", works[0], works[0], "--output", tmp_path / "z")
+    assert "run: capture4d run" in fails(capsys, "fit", tmp_path / "nothing")
+    line = fails(capsys, "fit", works[0], "--output", tmp_path / "w", "--split.held-out", "take9", *QUICK)
+    assert "found 'take9'" in line
+
+
+def test_a_take_with_one_frame_is_one_line(write_work, motion, tmp_path, capsys) -> None:
+    single = write_work(tmp_path / "single", motion(1, 0))
+    assert "at least 2 good frames to learn from, found 1 of 1" in fails(capsys, "fit", single, *QUICK)
+
+
+def test_poses_of_another_skeleton_are_one_line(model: Path, motion, tmp_path: Path, capsys) -> None:
+    poses = motion(4, 0)
+    save_poses(tmp_path / "other.npz", replace(poses, joint_names=("hip", "knee", "foot")))
+    line = fails(capsys, *animate(model, tmp_path / "other.npz", tmp_path / "x"))
+    assert "other.npz" in line
+    assert "joints" in line
+    body = load_body(model / "body.npz")
+    save_body(tmp_path / "body.npz", replace(body, joint_names=("hip", "knee", "foot")))
+    save_poses(tmp_path / "poses.npz", poses)
+    line = fails(capsys, *animate(model, tmp_path / "poses.npz", tmp_path / "x", "--body", tmp_path / "body.npz"))
+    assert "body.npz: body: expected the 3 joints of the model" in line
+    assert "at most 2" in fails(capsys, *animate(model, tmp_path / "poses.npz", tmp_path / "x", "--beta", *"1111"))
+    assert "NaN" in fails(capsys, *animate(model, tmp_path / "poses.npz", tmp_path / "x", "--beta", "nan"))
+
+
+def test_a_tracked_take_is_never_written_over(model: Path, works, tmp_path: Path, capsys) -> None:
+    poses = works[0] / "body" / "poses.npz"
+    assert "found output of 'register'" in fails(capsys, *animate(model, poses, works[1]))
+    (tmp_path / "tracked" / "body").mkdir(parents=True)
+    (tmp_path / "tracked" / "body" / "stage.json").write_text("{}")
+    assert "found a take with a tracked body" in fails(capsys, *animate(model, poses, tmp_path / "tracked"))
+
+
+def test_damaged_models_are_one_line(model: Path, works, tmp_path: Path, capsys) -> None:
+    poses = works[0] / "body" / "poses.npz"
+    path = model / "blendshapes.safetensors"
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-50])
+    assert "blendshapes.safetensors: not a readable safetensors file" in fails(
+        capsys, *animate(model, poses, tmp_path / "x")
+    )
+    path.write_bytes(pickle.dumps({"mean": [1, 2, 3]}))
+    assert "found a pickle" in fails(capsys, *animate(path, poses, tmp_path / "x"))
+    path.write_bytes(whole)
+    assert "expected a model" in fails(capsys, *animate(tmp_path / "nowhere", poses, tmp_path / "x"))
+
+    file = read_tensors(path, "capture4d blendshapes")
+    note = {key: value for key, value in file.note.items() if key != "kind"}
+    broken = {**file.tensors, "basis": np.full_like(file["basis"], np.nan)}
+    write_tensors(path, "capture4d blendshapes", broken, note)
+    assert "found NaN or inf" in fails(capsys, *animate(model, poses, tmp_path / "x"))
+    fewer = {**file.tensors, "template_vertices": file["template_vertices"][:-1]}
+    write_tensors(path, "capture4d blendshapes", fewer, note)
+    assert "expected indices from 0 to 278" in fails(capsys, *animate(model, poses, tmp_path / "x"))
+    write_tensors(path, "capture4d blendshapes", {**file.tensors, "std": 2 * file["std"]}, note)
+    assert "of another model" in fails(capsys, *animate(model, poses, tmp_path / "x"))
+    path.write_bytes(whole)
+
+    linear = read_tensors(model / "linear.safetensors", "capture4d linear regressor")
+    entries = {key: value for key, value in linear.note.items() if key != "kind"}
+    spoilt = {**linear.tensors, "intercept": np.full_like(linear["intercept"], np.nan)}
+    write_tensors(model / "linear.safetensors", "capture4d linear regressor", spoilt, entries)
+    assert "found NaN or inf in 'intercept'" in fails(capsys, *animate(model, poses, tmp_path / "x"))
+
+
+# --- splits
+
+
+def test_takes_are_given_whole_and_all_of_them() -> None:
+    names, lengths = [f"t{i}" for i in range(10)], [100] * 10
+    pieces = split_takes(names, lengths, 60.0, SplitConfig(held_out=("t3",), validation_share=0.2))
+    assert sorted(piece.take for piece in pieces) == list(range(10))
+    assert all(piece.frames == range(100) for piece in pieces)
+    roles = [piece.role for piece in sorted(pieces, key=lambda piece: piece.take)]
+    assert roles[3] == "held out"
+    assert roles.count("validation") == 2
+    assert pieces == split_takes(names, lengths, 60.0, SplitConfig(held_out=("t3",), validation_share=0.2))
+
+
+def test_a_single_take_is_cut_with_a_gap() -> None:
+    training, validation = split_takes(["only"], [600], 60.0, SplitConfig(gap_s=0.5, validation_share=0.1))
+    assert training.frames == range(510)
+    assert validation.frames == range(540, 600)
+    (whole,) = split_takes(["only"], [3], 60.0, SplitConfig())
+    assert whole.role == "training"
+    with pytest.raises(InputError, match="all set aside"):
+        split_takes(["only"], [30], 60.0, SplitConfig(held_out=("only",)))
