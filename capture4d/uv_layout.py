@@ -85,7 +85,7 @@ def _uv_area(mesh: Mesh) -> float:
 
 def _is_metric(mesh: Mesh) -> bool:
     on_mesh = float(face_areas(mesh.vertices.astype(float), mesh.faces).sum())
-    return abs(np.sqrt(_uv_area(mesh) / max(on_mesh, 1e-12)) - 1) < METRIC_TOLERANCE
+    return bool(abs(np.sqrt(_uv_area(mesh) / max(on_mesh, 1e-12)) - 1) < METRIC_TOLERANCE)
 
 
 def _boxes(uv: np.ndarray, island: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

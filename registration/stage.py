@@ -23,8 +23,8 @@ from capture4d.body_stage import load_tracking, tracking_digest
 from capture4d.errors import InputError
 from capture4d.garment_binding import with_body_shape
 from capture4d.garment_stage import load_garment_scan
-from capture4d.scans import Capture, load_garment, read_body, read_capture, read_poses, read_template, save_garment
-from capture4d.types import Body, Garment, PoseSequence, RegisteredSequence
+from capture4d.scans import Capture, read_body, read_capture, read_poses, read_template, save_garment
+from capture4d.types import Body, Garment, PoseSequence
 from capture4d.workdir import (
     Stage,
     open_stage,
@@ -40,7 +40,7 @@ from registration.config import RegistrationConfig
 from registration.sequence import FrameResult, Mover, register_run, segments
 from registration.template import TemplateAnalysis, analyse_template
 
-__all__ = ["load_registration", "run"]
+__all__ = ["run"]
 
 SCHEMA = 1
 VERDICTS = ("good", "check", "failed")
@@ -100,18 +100,6 @@ def run(
     ):  # fmt: skip
         pass
     return _collect(stage, description.frame_ids)
-
-
-def load_registration(folder: Path) -> RegisteredSequence:
-    """Read a finished registration; the vertices stay on disk until they are touched."""
-    garment = load_garment(folder / "garment.npz")
-    frame_ids = [int(path.stem) for path in sorted((folder / "frames").glob("*.npz"))]
-    residual = []
-    for frame_id in frame_ids:
-        with np.load(folder / "frames" / f"{frame_id:06d}.npz", allow_pickle=False) as arrays:
-            residual.append(arrays["residual_m"])
-    vertices = np.load(folder / "vertices.npy", mmap_mode="r", allow_pickle=False)
-    return RegisteredSequence(garment, vertices, np.array(residual, np.float32), np.array(frame_ids, np.int32))
 
 
 def _moving(capture: Capture, body_folder: Path | None) -> tuple[Body | None, PoseSequence | None]:

@@ -25,10 +25,10 @@ from capture4d.app.report_pictures import Framing, Panel, colour_bar, draw_frame
 from capture4d.app.report_stages import Calibration, StagePictures, Tracking, calibration, draw_stages, tracking
 from capture4d.errors import InputError
 from capture4d.evaluation import correspondence_errors, material_points
+from capture4d.registered_takes import load_registration
 from capture4d.scans import Capture, TruthModel, read_capture, read_scan, read_truth_model, read_truth_vertices
 from capture4d.types import RegisteredSequence
 from capture4d.workdir import open_stage, read_json, require_complete, run_jobs, write_bytes, write_json
-from registration.stage import load_registration
 
 __all__ = ["ReportConfig", "run"]
 

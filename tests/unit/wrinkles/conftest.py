@@ -1,0 +1,59 @@
+"""A small sleeve of cloth with seams, and scans of it that carry wrinkles."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from capture4d.mesh import boundary_loops
+from capture4d.types import Garment, Mesh
+
+
+def sleeve(around: int, along: int) -> Mesh:
+    """An open tube about Y, 0.2 m across and 0.5 m high, in two panels with UVs in metres, wound outwards."""
+    angle = 2 * np.pi * np.arange(around) / around
+    heights = np.linspace(0, 0.5, along)
+    vertices = np.array([(0.1 * np.sin(a), y, 0.1 * np.cos(a)) for y in heights for a in angle], np.float32)
+    row, column = np.divmod(np.arange(around * (along - 1)), around)
+    a, b = row * around + column, row * around + (column + 1) % around
+    faces = np.concatenate([np.stack([a, b, b + around], 1), np.stack([a, b + around, a + around], 1)]).astype(np.int32)
+    # unroll: u is arc length; the second half of the turn is a panel of its own, beside the first
+    turn = angle[faces % around]
+    turn = np.where((turn == 0) & (turn.max(axis=1, keepdims=True) > np.pi), 2 * np.pi, turn)
+    u = 0.1 * turn + np.where(turn.mean(axis=1, keepdims=True) > np.pi, 0.1, 0.0)
+    uv = np.stack([u, vertices[faces][..., 1]], axis=-1).astype(np.float32)
+    return Mesh(vertices, faces, uv)
+
+
+@pytest.fixture
+def garment() -> Garment:
+    mesh = sleeve(32, 24)
+    low, high = sorted(boundary_loops(mesh.faces), key=lambda loop: mesh.vertices[loop, 1].mean())
+    return Garment(mesh, {"hem": low, "neck": high})
+
+
+def wrinkled(points: np.ndarray, height_m: float = 0.002, phase: float = 0.0) -> np.ndarray:
+    """Tube points moved in and out by waves of 50 mm along the tube."""
+    radius = np.linalg.norm(points[:, [0, 2]], axis=1, keepdims=True)
+    out = points / radius * np.array([1, 0, 1])
+    return points + height_m * np.sin(2 * np.pi * points[:, 1:2] / 0.05 + phase) * out
+
+
+def wrinkle_normals(points: np.ndarray, height_m: float = 0.002, phase: float = 0.0) -> np.ndarray:
+    """Exact normals of the wrinkled tube above tube points."""
+    out = points * np.array([1, 0, 1])
+    out /= np.linalg.norm(out, axis=1, keepdims=True)
+    slope = height_m * 2 * np.pi / 0.05 * np.cos(2 * np.pi * points[:, 1:2] / 0.05 + phase)
+    normal = out - slope * np.array([0, 1, 0])
+    return normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+
+@pytest.fixture
+def scan_of() -> Callable[..., Mesh]:
+    def make(*, height_m: float = 0.002, noise_m: float = 0.0, phase: float = 0.0, seed: int = 0) -> Mesh:
+        fine = sleeve(200, 170)
+        points = wrinkled(fine.vertices.astype(float), height_m, phase)
+        points += noise_m * np.random.default_rng(seed).standard_normal(points.shape)
+        return Mesh(points.astype(np.float32), fine.faces)
+
+    return make
