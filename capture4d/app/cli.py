@@ -19,6 +19,8 @@ from typing import Annotated, Any, Literal, NoReturn
 import tyro
 from tyro.conf import Positional, UseAppendAction, arg
 
+from capture4d.app.cli_options import StageOptions, all_cores
+from capture4d.app.cli_wrinkles import WrinklesApply, WrinklesMaps, WrinklesTrain
 from capture4d.body_tracking_config import TrackingConfig
 from capture4d.calibration_config import CalibrationConfig, RigCheckConfig
 from capture4d.errors import InputError
@@ -26,6 +28,7 @@ from data_synth import config as synth_config
 from data_synth.scanner_config import ScanConfig
 from registration import config as registration_config
 from registration.config import MeshRegistrationConfig, RegistrationConfig
+from wrinkles import config as wrinkle_config
 
 # What a user's disk can answer; the message names the path, and a traceback would add nothing.
 _DISK_ANSWERS = {
@@ -40,20 +43,8 @@ _DISK_ANSWERS = {
 }
 
 
-def _all_cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 @dataclass(frozen=True, kw_only=True)
-class _Stage:
-    workers: int = field(default_factory=_all_cores)
-    """Processes to use; the result does not depend on it."""
-    overwrite: bool = False
-    """Start clean: delete what an earlier run left in the output folder."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Demo(_Stage):
+class Demo(StageOptions):
     """Make a synthetic capture, register it, and report: the whole pipeline in minutes."""
 
     output: Path = Path("out")
@@ -74,7 +65,7 @@ def _with_sensor(config: Any, sensor: Literal["depth", "stereo"] | None) -> Any:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Synth(_Stage):
+class Synth(StageOptions):
     """Simulate a garment on a moving body and scan it: a capture folder with its exact truth."""
 
     output: Annotated[Positional[Path], arg(metavar="OUTPUT")]
@@ -94,7 +85,7 @@ class Synth(_Stage):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scan(_Stage):
+class Scan(StageOptions):
     """Scan your own mesh sequence with the virtual camera rig: a capture folder, with truth if the faces stay."""
 
     meshes: Annotated[Positional[Path], arg(metavar="MESHES")]
@@ -150,7 +141,7 @@ class Check:
     """Write a corrected take to CAPTURE-fixed; looks at every frame."""
     json: bool = False
     """Print JSON instead of a table."""
-    workers: int = field(default_factory=_all_cores)
+    workers: int = field(default_factory=all_cores)
     """Processes to use; the result does not depend on it."""
 
     def __call__(self) -> int:
@@ -182,7 +173,7 @@ class Check:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Extract(_Stage):
+class Extract(StageOptions):
     """Cut the garment out of every scan by its colour, and find its painted borders."""
 
     capture: Annotated[Positional[Path], arg(metavar="CAPTURE")]
@@ -208,7 +199,7 @@ class Extract(_Stage):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Track(_Stage):
+class Track(StageOptions):
     """Track the body through every scan: its poses, and one shape for the take."""
 
     capture: Annotated[Positional[Path], arg(metavar="CAPTURE")]
@@ -226,7 +217,7 @@ class Track(_Stage):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Register(_Stage):
+class Register(StageOptions):
     """Register the template to every frame whose garment `extract` has cut out."""
 
     capture: Annotated[Positional[Path], arg(metavar="CAPTURE")]
@@ -325,7 +316,7 @@ class Template:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Run(_Stage):
+class Run(StageOptions):
     """Run every stage on a capture: extract, track if it brings no poses, register, report."""
 
     capture: Annotated[Positional[Path], arg(metavar="CAPTURE")]
@@ -356,7 +347,7 @@ class Run(_Stage):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Report(_Stage):
+class Report(StageOptions):
     """Draw the report of a registered capture, and check its metrics against limits."""
 
     work: Annotated[Positional[Path], arg(metavar="WORK")]
@@ -407,7 +398,7 @@ class Calibrate:
     """rig.json to write; calibration.json and calibration.html go beside it."""
     pattern: str = "{camera}/{pose}"
     """How the images lie in the folder, without their ending."""
-    workers: int = field(default_factory=_all_cores)
+    workers: int = field(default_factory=all_cores)
     """Processes to use; the result does not depend on it."""
     colmap: Path | None = None
     """Folder for the rig as a COLMAP model as well."""
@@ -444,7 +435,7 @@ class CheckRig:
     """The board, if it is not the one of the calibration."""
     pattern: str = "{camera}/{pose}"
     """How the images lie in the folder, without their ending."""
-    workers: int = field(default_factory=_all_cores)
+    workers: int = field(default_factory=all_cores)
     """Processes to use; the result does not depend on it."""
     config: Annotated[RigCheckConfig, arg(name="")] = field(default_factory=RigCheckConfig)
 
@@ -519,6 +510,9 @@ _COMMANDS: Mapping[str, Any] = {
     "register": Register,
     "run": Run,
     "report": Report,
+    "wrinkles maps": WrinklesMaps,
+    "wrinkles train": WrinklesTrain,
+    "wrinkles apply": WrinklesApply,
     "register-mesh": RegisterMesh,
     "calibrate": Calibrate,
     "check-rig": CheckRig,
@@ -531,6 +525,7 @@ _PRESETS: Mapping[Any, Mapping[str, Any]] = {
     Synth: synth_config.PRESETS,
     Register: registration_config.PRESETS,
     Run: registration_config.PRESETS,
+    WrinklesTrain: wrinkle_config.PRESETS,
 }
 
 
@@ -578,6 +573,11 @@ def _dispatch(arguments: list[str]) -> int:
         print(f"capture4d {version('capture4d')}")
         return 0
     name, *rest = arguments
+    if any(command.startswith(f"{name} ") for command in _COMMANDS):  # a group, such as `wrinkles train`
+        if not rest or rest[0] in ("-h", "--help"):
+            print(_overview(f"{name} "))
+            return 0 if rest else 2
+        name, rest = f"{name} {rest[0]}", rest[1:]
     if name not in _COMMANDS:
         near = difflib.get_close_matches(name, _COMMANDS, n=1)
         hint = f"; did you mean '{near[0]}'?" if near else ""
@@ -611,8 +611,12 @@ def _value_of(option: str, arguments: list[str]) -> str | None:
     return None
 
 
-def _overview() -> str:
-    lines = [f"  {name:<15}{(command.__doc__ or '').splitlines()[0]}" for name, command in _COMMANDS.items()]
+def _overview(group: str = "") -> str:
+    lines = [
+        f"  {name:<15} {(command.__doc__ or '').splitlines()[0]}"
+        for name, command in _COMMANDS.items()
+        if name.startswith(group)
+    ]
     return "\n".join(
         [
             "usage: capture4d COMMAND ...",

@@ -1,12 +1,17 @@
 """A small sleeve of cloth with seams, and scans of it that carry wrinkles."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from capture4d.garment_stage import save_garment_scan
 from capture4d.mesh import boundary_loops
-from capture4d.types import Garment, Mesh
+from capture4d.records import save_garment
+from capture4d.scans import Capture, write_capture_description
+from capture4d.types import Garment, GarmentScan, Mesh
+from capture4d.workdir import open_stage, write_bytes, write_npy, write_npz
 
 
 def sleeve(around: int, along: int) -> Mesh:
@@ -57,3 +62,31 @@ def scan_of() -> Callable[..., Mesh]:
         return Mesh(points.astype(np.float32), fine.faces)
 
     return make
+
+
+def make_work(folder: Path, garment: Garment, scans: list[Mesh], *, frame_ids: list[int] | None = None) -> Path:
+    """A capture whose garment is cut out and registered, as the stages before leave it; the template does not move."""
+    ids = frame_ids or list(range(1, len(scans) + 1))
+    capture = Capture(folder / "capture", "sleeve", 60.0, tuple(ids), (47, 98, 201))
+    write_capture_description(capture)
+    for frame_id in ids:  # only their names matter once the garments are cut out
+        write_bytes(capture.path / "scans" / f"{frame_id:06d}.ply", b"ply")
+    work = folder / "work"
+    cut = open_stage(work / "garment", name="extract", schema=1, config=None, upstream={},
+                     sources={"capture": capture.path})  # fmt: skip
+    placed = open_stage(work / "registration", name="register", schema=1, config=None, upstream={})
+    vertices = garment.template.vertices
+    save_garment(placed.path / "garment.npz", garment)
+    none = np.zeros((0, 3), np.float32)
+    for frame_id, scan in zip(ids, scans, strict=True):
+        save_garment_scan(cut.frame_path(frame_id), GarmentScan(scan, none, none[:, 0].astype(np.int32), (), frame_id))
+        write_npz(placed.frame_path(frame_id), vertices=vertices, residual_m=np.zeros(len(vertices), np.float32))
+    write_npy(placed.path / "vertices.npy", np.tile(vertices, (len(ids), 1, 1)))
+    cut.finish([cut.frame_path(frame_id) for frame_id in ids])
+    placed.finish([placed.path / "vertices.npy"])
+    return work
+
+
+@pytest.fixture
+def work(tmp_path: Path, garment: Garment, scan_of: Callable[..., Mesh]) -> Path:
+    return make_work(tmp_path, garment, [scan_of(phase=0.3 * frame) for frame in range(6)])
