@@ -20,7 +20,7 @@ import tyro
 from tyro.conf import Positional, UseAppendAction, arg
 
 from capture4d.app.cli_options import StageOptions, all_cores
-from capture4d.app.cli_wrinkles import WrinklesApply, WrinklesMaps, WrinklesTrain
+from capture4d.app.cli_wrinkles import Compare, WrinklesApply, WrinklesMaps, WrinklesTrain
 from capture4d.body_tracking_config import TrackingConfig
 from capture4d.calibration_config import CalibrationConfig, RigCheckConfig
 from capture4d.errors import InputError
@@ -513,6 +513,7 @@ _COMMANDS: Mapping[str, Any] = {
     "wrinkles maps": WrinklesMaps,
     "wrinkles train": WrinklesTrain,
     "wrinkles apply": WrinklesApply,
+    "compare": Compare,
     "register-mesh": RegisterMesh,
     "calibrate": Calibrate,
     "check-rig": CheckRig,

@@ -9,10 +9,11 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from capture4d.app.cli_options import StageOptions, all_cores
+from capture4d.app.compare_config import CompareConfig
 from wrinkles import config as wrinkle_config
 from wrinkles.config import PairConfig, WrinkleConfig
 
-__all__ = ["WrinklesApply", "WrinklesMaps", "WrinklesTrain"]
+__all__ = ["Compare", "WrinklesApply", "WrinklesMaps", "WrinklesTrain"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,4 +76,22 @@ class WrinklesApply(StageOptions):
         settings = ApplyConfig(flip_green=self.flip_green, bits=self.bits)
         run(self.model, self.work, settings, workers=self.workers, overwrite=self.overwrite)
         print(f"maps: {self.work / 'wrinkles' / 'generated' / 'frames'}")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Compare(StageOptions):
+    """Compare registration, generated maps and offset images on the same held-out frames: one table, one page."""
+
+    work: Annotated[Positional[Path], arg(metavar="WORK")]
+    """Work folder; holds garment/ and registration/, gets compare/."""
+    model: Path
+    """Model folder of `wrinkles train`."""
+    config: Annotated[CompareConfig, arg(name="")] = field(default_factory=CompareConfig)
+
+    def __call__(self) -> int:
+        from capture4d.app.compare import run
+
+        page = run(self.work, self.model, self.config, workers=self.workers, overwrite=self.overwrite)
+        print(f"comparison: {page}")
         return 0
