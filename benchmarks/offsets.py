@@ -78,7 +78,10 @@ def run(
     else:
         tested = _joined([_frames(layout, work, joints) for work in tests])
         cut = max(len(learned) // 9, 1)  # the paper regularises on a ninth
-        learned, validation = learned.rows(range(len(learned) - cut)), learned.rows(range(len(learned) - cut, len(learned)))
+        learned, validation = (
+            learned.rows(range(len(learned) - cut)),
+            learned.rows(range(len(learned) - cut, len(learned))),
+        )
     sampler = OffsetSampler(layout)
     torch.manual_seed(0)
     pose_size = learned.pose.shape[1]
@@ -117,7 +120,12 @@ def _frames(layout: OffsetLayout, work: Path, joints: np.ndarray) -> OffsetFrame
     assert body is not None
     rows = [poses.frame_ids.tolist().index(frame_id) for frame_id in sequence.frame_ids.tolist()]
     chosen = type(poses)(
-        poses.rotations[rows], poses.translations[rows], poses.shape, poses.frame_ids[rows], poses.fps, poses.joint_names
+        poses.rotations[rows],
+        poses.translations[rows],
+        poses.shape,
+        poses.frame_ids[rows],
+        poses.fps,
+        poses.joint_names,
     )
     return offset_frames(layout, body, chosen, np.array(sequence.vertices), joints)
 

@@ -30,9 +30,7 @@ def registered_work(config: SynthConfig, *, workers: int) -> tuple[Path, Path]:
     return capture, work
 
 
-def locate_texels(
-    texel_uv: np.ndarray, fine_uv: np.ndarray, *, candidates: int = 8
-) -> tuple[np.ndarray, np.ndarray]:
+def locate_texels(texel_uv: np.ndarray, fine_uv: np.ndarray, *, candidates: int = 8) -> tuple[np.ndarray, np.ndarray]:
     """The face of the simulated garment under points of the pattern, and their barycentrics in it.
 
     Args:

@@ -64,7 +64,9 @@ def run(model: Path, work: Path, config: ApplyConfig, *, workers: int = 1, overw
     sequence = load_registration(work / "registration")
     template = MapTemplate.create(sequence.garment, config.map)
     if layout_digest(template.mesh, config.map.size) != generator.layout_digest:
-        raise InputError(f"{work}: expected the template that {weights} was trained on, found another mesh or UV layout")
+        raise InputError(
+            f"{work}: expected the template that {weights} was trained on, found another mesh or UV layout"
+        )
     output = work / "wrinkles" / "generated"
     upstream = {"registration": digest, "model": file_digest([weights], root=weights.parent)}
     stage = open_stage(output, name="wrinkles", schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite)

@@ -9,9 +9,7 @@ from jaxtyping import Bool, Float, Float32
 __all__ = ["fill_holes"]
 
 
-def fill_holes(
-    image: Float[np.ndarray, "H W C"], valid: Bool[np.ndarray, "H W"]
-) -> Float32[np.ndarray, "H W C"]:
+def fill_holes(image: Float[np.ndarray, "H W C"], valid: Bool[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W C"]:
     """Valid texels as they are, the others from the nearest coarser level of a pyramid that knows them (push-pull).
 
     For tangent-space maps: a hole then takes on the wrinkles around it, fading into the template's own surface.

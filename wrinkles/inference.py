@@ -25,7 +25,9 @@ MAP_KEYS = ("texels", "map_size", "layout_digest")
 class WrinkleModel:
     """A generator and the maps it was trained on."""
 
-    def __init__(self, generator: UNet, config: NetworkConfig, *, texels: int, map_size: int, layout_digest: str) -> None:
+    def __init__(
+        self, generator: UNet, config: NetworkConfig, *, texels: int, map_size: int, layout_digest: str
+    ) -> None:
         self.generator = generator
         self.config = config
         self.texels = texels

@@ -43,16 +43,12 @@ def garment_rotation(
     return left @ handedness @ right
 
 
-def to_tangent(
-    normals: Float[np.ndarray, "N 3"], frames: Float[np.ndarray, "N 3 3"]
-) -> Float[np.ndarray, "N 3"]:
+def to_tangent(normals: Float[np.ndarray, "N 3"], frames: Float[np.ndarray, "N 3 3"]) -> Float[np.ndarray, "N 3"]:
     """Global normals in tangent frames (rows tangent, bitangent, normal)."""
     return np.einsum("nrc,nc->nr", frames, normals)
 
 
-def from_tangent(
-    normals: Float[np.ndarray, "N 3"], frames: Float[np.ndarray, "N 3 3"]
-) -> Float[np.ndarray, "N 3"]:
+def from_tangent(normals: Float[np.ndarray, "N 3"], frames: Float[np.ndarray, "N 3 3"]) -> Float[np.ndarray, "N 3"]:
     """Tangent-space normals in global coordinates."""
     return np.einsum("nrc,nr->nc", frames, normals)
 

@@ -47,7 +47,12 @@ class UNet(nn.Module):
             nn.Sequential(
                 nn.ReLU(),
                 nn.ConvTranspose2d(
-                    width[layer] * (1 if layer == last else 2), width[layer - 1] if layer else 3, 4, 2, 1, bias=not layer
+                    width[layer] * (1 if layer == last else 2),
+                    width[layer - 1] if layer else 3,
+                    4,
+                    2,
+                    1,
+                    bias=not layer,
                 ),
                 *([nn.BatchNorm2d(width[layer - 1])] if layer else [nn.Tanh()]),
                 *([nn.Dropout(config.dropout)] if layer in dropping else []),

@@ -74,7 +74,7 @@ def temporal_window(frame_ids: Sequence[int], index: int, *, fps: float, config:
     reach = config.temporal_frames // 2
 
     def adjoin(a: int, b: int) -> bool:
-        return 0 <= a and b < len(frame_ids) and (frame_ids[b] - frame_ids[a]) / fps <= config.temporal_span_s
+        return a >= 0 and b < len(frame_ids) and (frame_ids[b] - frame_ids[a]) / fps <= config.temporal_span_s
 
     first = last = index
     while index - first < reach and adjoin(first - 1, first):

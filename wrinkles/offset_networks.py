@@ -47,7 +47,9 @@ class FullyConnected(nn.Module):
 class PcaFullyConnected(nn.Module):
     """The baseline with PCA: pose to coefficients of the offsets' principal components."""
 
-    def __init__(self, pose_size: int, offsets: Float[Tensor, "frames P 3"], *, components: int, hidden: int = 256) -> None:
+    def __init__(
+        self, pose_size: int, offsets: Float[Tensor, "frames P 3"], *, components: int, hidden: int = 256
+    ) -> None:
         """Analyse the training offsets; components beyond their rank are left out."""
         super().__init__()
         flat = offsets.flatten(1).double()

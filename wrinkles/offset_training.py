@@ -104,7 +104,9 @@ def offset_frames(
         return torch.from_numpy(np.stack(arrays).astype(np.float32))
 
     pose = torch.from_numpy(np.ascontiguousarray(poses.rotations[:, joints]).reshape(len(vertices), -1))
-    return OffsetFrames(pose, stacked(offsets), stacked(points), stacked(axes), CM * torch.from_numpy(np.array(vertices)))
+    return OffsetFrames(
+        pose, stacked(offsets), stacked(points), stacked(axes), CM * torch.from_numpy(np.array(vertices))
+    )
 
 
 def grid_loss(

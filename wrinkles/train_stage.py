@@ -71,14 +71,14 @@ def run(
     digest = layout_digest(mesh, size)
     for work, take in zip(works, takes, strict=True):
         if layout_digest(pair_template(work), take.low.shape[-1]) != digest:
-            raise InputError(f"{work}: expected the UV layout of {works[0]}, found another; one network needs one layout")
+            raise InputError(
+                f"{work}: expected the UV layout of {works[0]}, found another; one network needs one layout"
+            )
     stage = open_stage(
         output, name="train-wrinkles", schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite
     )
     torch.set_num_threads(workers)
-    parts = [
-        split(fitted(take, config.texels), held_out=config.held_out, gap=config.held_out_gap) for take in takes
-    ]
+    parts = [split(fitted(take, config.texels), held_out=config.held_out, gap=config.held_out_gap) for take in takes]
     state = new_state(config)
     _resume(stage, state)
     _train(stage, state, [train for train, _ in parts], [held for _, held in parts], config)

@@ -88,9 +88,7 @@ def _generator_loss(
 ) -> tuple[Float[Tensor, ""], dict[str, float]]:
     weights: LossConfig = config.loss
     data = data_loss(generated, batch.high, batch.valid)
-    temporal = temporal_loss(
-        generated, batch.previous, batch.valid & batch.previous_valid, weights.temporal_kind
-    )
+    temporal = temporal_loss(generated, batch.previous, batch.valid & batch.previous_valid, weights.temporal_kind)
     total = weights.data * data + weights.temporal * temporal
     parts = {"data": data.item(), "temporal": temporal.item(), "gan": 0.0}
     if weights.gan > 0:
@@ -152,9 +150,7 @@ def load_weights(network: nn.Module, weights: Mapping[str, Tensor], *, source: s
     other = [key for key in own.keys() & weights.keys() if own[key].shape != weights[key].shape]
     if missing or strange or other:
         key = min(other or missing or strange)
-        expected, found = (
-            tuple(each[key].shape) if key in each else "none" for each in (own, weights)
-        )
+        expected, found = (tuple(each[key].shape) if key in each else "none" for each in (own, weights))
         raise InputError(f"{source}: weights of another architecture: '{key}', expected {expected}, found {found}")
     network.load_state_dict(weights)
 

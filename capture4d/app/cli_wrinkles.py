@@ -50,9 +50,7 @@ class WrinklesTrain(StageOptions):
     def __call__(self) -> int:
         from wrinkles.train_stage import run
 
-        run(
-            self.works, self.output, self.config, pairs=self.pairs, workers=self.workers, overwrite=self.overwrite
-        )
+        run(self.works, self.output, self.config, pairs=self.pairs, workers=self.workers, overwrite=self.overwrite)
         print(f"model: {self.output}")
         return 0
 

@@ -24,7 +24,6 @@ from capture4d.app.compare_config import CompareConfig
 from capture4d.app.render import Drawn, heat_colours, render
 from capture4d.app.report_pictures import HEIGHT, WIDTH, Framing, Panel, colour_bar, data_uri
 from capture4d.body_stage import load_tracking
-from capture4d.errors import InputError
 from capture4d.evaluation import correspondence_errors, material_points
 from capture4d.registered_takes import load_registration, registered_digest, work_capture
 from capture4d.scans import Capture, read_body, read_poses, read_scan, read_truth_model, read_truth_vertices
@@ -120,7 +119,11 @@ def run(
     table = [_measure(method, template, held, truth, methods[0]) for method in methods]
     chosen = np.unique(np.linspace(0, len(held.frame_ids) - 1, min(config.pictures, len(rows))).astype(int))
     frames = [
-        (int(held.frame_ids[at]), _pictures(capture, template, methods, held, int(at)), _strip(template, methods, held, int(at)))
+        (
+            int(held.frame_ids[at]),
+            _pictures(capture, template, methods, held, int(at)),
+            _strip(template, methods, held, int(at)),
+        )
         for at in chosen
     ]
     write_json(stage.path / "compare.json", {"frames": held.frame_ids, "methods": [asdict(row) for row in table]})
@@ -189,7 +192,10 @@ def _offset_methods(
     assert garment.skin_weights is not None
     order = [poses.frame_ids.tolist().index(frame_id) for frame_id in sequence.frame_ids.tolist()]
     ordered = replace(
-        poses, rotations=poses.rotations[order], translations=poses.translations[order], frame_ids=poses.frame_ids[order]
+        poses,
+        rotations=poses.rotations[order],
+        translations=poses.translations[order],
+        frame_ids=poses.frame_ids[order],
     )
     joints = pose_joints(ordered, garment.skin_weights)
     layout = OffsetLayout.create(garment, size)

@@ -30,7 +30,9 @@ def test_mirrored_uvs_have_the_other_handedness():
     mirrored = mesh.uv * np.array([-1, 1], np.float32) + np.array([1, 0], np.float32)
     tangent = corner_tangents(mesh.vertices, mesh.faces, mirrored)
     np.testing.assert_array_equal(tangent[..., 3], -1)
-    np.testing.assert_allclose(tangent[..., :3], -corner_tangents(mesh.vertices, mesh.faces, mesh.uv)[..., :3], atol=1e-6)
+    np.testing.assert_allclose(
+        tangent[..., :3], -corner_tangents(mesh.vertices, mesh.faces, mesh.uv)[..., :3], atol=1e-6
+    )
 
 
 def test_tangents_are_unit_orthogonal_to_the_normals_and_shared_by_a_vertex():

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from capture4d.errors import InputError
 from capture4d.types import Mesh
 from capture4d.uv_layout import millimetres_per_texel, unit_square

@@ -30,11 +30,16 @@ def sleeve(around: int, along: int) -> Mesh:
     return Mesh(vertices, faces, uv)
 
 
-@pytest.fixture
-def garment() -> Garment:
+def some_garment() -> Garment:
+    """The sleeve as a template."""
     mesh = sleeve(32, 24)
     low, high = sorted(boundary_loops(mesh.faces), key=lambda loop: mesh.vertices[loop, 1].mean())
     return Garment(mesh, {"hem": low, "neck": high})
+
+
+@pytest.fixture
+def garment() -> Garment:
+    return some_garment()
 
 
 def wrinkled(points: np.ndarray, height_m: float = 0.002, phase: float = 0.0) -> np.ndarray:
@@ -53,15 +58,17 @@ def wrinkle_normals(points: np.ndarray, height_m: float = 0.002, phase: float = 
     return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
 
+def some_scan(*, height_m: float = 0.002, noise_m: float = 0.0, phase: float = 0.0, seed: int = 0) -> Mesh:
+    """A fine sleeve with waves along it."""
+    fine = sleeve(200, 170)
+    points = wrinkled(fine.vertices.astype(float), height_m, phase)
+    points += noise_m * np.random.default_rng(seed).standard_normal(points.shape)
+    return Mesh(points.astype(np.float32), fine.faces)
+
+
 @pytest.fixture
 def scan_of() -> Callable[..., Mesh]:
-    def make(*, height_m: float = 0.002, noise_m: float = 0.0, phase: float = 0.0, seed: int = 0) -> Mesh:
-        fine = sleeve(200, 170)
-        points = wrinkled(fine.vertices.astype(float), height_m, phase)
-        points += noise_m * np.random.default_rng(seed).standard_normal(points.shape)
-        return Mesh(points.astype(np.float32), fine.faces)
-
-    return make
+    return some_scan
 
 
 def make_work(folder: Path, garment: Garment, scans: list[Mesh], *, frame_ids: list[int] | None = None) -> Path:
@@ -85,8 +92,3 @@ def make_work(folder: Path, garment: Garment, scans: list[Mesh], *, frame_ids: l
     cut.finish([cut.frame_path(frame_id) for frame_id in ids])
     placed.finish([placed.path / "vertices.npy"])
     return work
-
-
-@pytest.fixture
-def work(tmp_path: Path, garment: Garment, scan_of: Callable[..., Mesh]) -> Path:
-    return make_work(tmp_path, garment, [scan_of(phase=0.3 * frame) for frame in range(6)])

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+
 from wrinkles.losses import data_loss, gan_loss, temporal_loss
 
 EVERYWHERE = torch.ones(1, 1, 16, 16, dtype=torch.bool)

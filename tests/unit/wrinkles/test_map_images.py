@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from capture4d.errors import InputError
 from capture4d.types import Garment
 from wrinkles.config import MapConfig

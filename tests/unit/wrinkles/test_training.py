@@ -48,7 +48,7 @@ def test_an_overfitted_pair_is_learned_by_heart():
 
 
 def test_a_resumed_run_is_the_same_run_bit_for_bit():
-    def go_on(state, steps: int):  # noqa: ANN001
+    def go_on(state, steps: int):
         stream = batches([take()], size=2, seed=CONFIG.seed, start=state.step)
         for batch, _ in zip(stream, range(steps), strict=False):
             train_step(state, batch, CONFIG)
