@@ -3,8 +3,8 @@
 Limits this was built against: `image_floor_mm` 0.3 (a round trip through images of 256 texels),
 `decoder_to_mean_baseline` 0.6, and the baseline with PCA better than without.
 
-The paper prints, in cm, training / test (Jin et al., Tables 1 and 2; 20,011 simulated poses): decoder with L2 and normal
-loss 0.37 / 0.51, fully connected 0.65 / 0.67, with 128 components 0.50 / 0.55.
+The paper prints, in cm, training / test (Jin et al., Tables 1 and 2; 20,011 simulated poses): decoder with L2 and
+normal loss 0.37 / 0.51, fully connected 0.65 / 0.67, with 128 components 0.50 / 0.55.
 """
 
 from __future__ import annotations

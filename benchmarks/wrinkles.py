@@ -24,6 +24,7 @@ from typing import get_args
 import numpy as np
 import torch
 from rich.console import Console
+from rich.table import Table
 
 from benchmarks.metric import Metric
 from benchmarks.registered_work import QUICK_TAKE, registered_work
@@ -46,7 +47,7 @@ from wrinkles.networks import UNet
 from wrinkles.pair_files import load_pairs, pair_template
 from wrinkles.pair_stage import run as make_pairs
 from wrinkles.pairs import fitted
-from wrinkles.train_stage import run as train
+from wrinkles.train_stage import run as train_network
 from wrinkles.train_stage import score_take
 
 PRINTED: dict[TemporalLoss, tuple[float, float]] = {
@@ -113,13 +114,13 @@ def run(
     base = replace(base, held_out=0.0)
     for work in (*clips.like, *clips.unlike):
         make_pairs(work, clips.pairs, workers=workers)
-    results, unlike_ratios, eval_errors = [], [], {}
+    results, unlike_ratios, evidence = [], [], []
     with tempfile.TemporaryDirectory() as scratch:
         for seed in range(seeds):
             model = _trained(clips, replace(base, seed=seed), Path(scratch) / f"seed{seed}", workers)
             results.append(_scored(model, clips.like))
             unlike_ratios.append(_scored(model, clips.unlike).ratio)
-            eval_errors[seed] = _norm_evidence(model, clips.like)
+            evidence.append(_norm_evidence(model, clips.like))
         shorter = replace(base, schedule=replace(base.schedule, steps=cell_steps))
         cells = {
             kind: _scored(
@@ -164,7 +165,7 @@ def _quick_clips(workers: int) -> _Clips:
 
 def _trained(clips: _Clips, config: WrinkleConfig, output: Path, workers: int) -> WrinkleModel:
     Console(stderr=True).print(f"{output.name}: {config.schedule.steps} steps", highlight=False)
-    train(clips.train, output, config, pairs=clips.pairs, workers=workers)
+    train_network(clips.train, output, config, pairs=clips.pairs, workers=workers)
     return load_model(str(output / "generator.safetensors"))
 
 
@@ -208,12 +209,14 @@ def _cell_metrics(cells: dict[TemporalLoss, _Result]) -> list[Metric]:
 
 
 def _print_cells(cells: dict[TemporalLoss, _Result]) -> None:
+    """Ours beside the printed ones."""
+    table = Table("temporal term", "Data", "paper", "Temporal, net change", "Temporal, texel by texel", "paper")
     for kind, result in cells.items():
         data, temporal = PRINTED[kind]
-        Console().print(
-            f"temporal {kind}: Data {result.made.data:.2f} (paper {data}), Temporal {result.made.temporal_printed:.2f} as "
-            f"a net change, {result.made.temporal_texels:.2f} texel by texel (paper {temporal})", highlight=False,
-        )  # fmt: skip
+        made = result.made
+        ours = (made.data, data, made.temporal_printed, made.temporal_texels, temporal)
+        table.add_row(kind, *(f"{value:.2f}" for value in ours))
+    Console().print(table)
 
 
 def _milliseconds(config: WrinkleConfig, repeats: int, threads: int) -> float:

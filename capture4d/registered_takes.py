@@ -62,6 +62,6 @@ def work_capture(work: Path) -> Capture:
     record_path = work / "garment" / "stage.json"
     place = read_json(record_path).get("sources", {}).get("capture") if record_path.is_file() else None
     if place is None:
-        raise InputError(f"{work}: expected the scans' garments of 'extract', found none; run: capture4d extract CAPTURE "
-                         f"--output {work}")  # fmt: skip
+        raise InputError(f"{work}: expected the scans' garments of 'extract', found none; run: capture4d extract "
+                         f"CAPTURE --output {work}")  # fmt: skip
     return read_capture(place)

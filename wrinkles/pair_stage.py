@@ -62,8 +62,12 @@ def run(work: Path, config: PairConfig, *, workers: int = 1, overwrite: bool = F
     jobs = [
         _Run(work, stage, fps, positions) for positions in runs if pending.intersection(frame_ids[p] for p in positions)
     ]
-    for _ in run_jobs(partial(_make, config), jobs, workers=workers, label="normal maps", units=_length,
-                      finished=lambda: len(frame_ids) - len(stage.pending(frame_ids, ".png", folder="high"))):  # fmt: skip
+
+    def finished() -> int:
+        return len(frame_ids) - len(stage.pending(frame_ids, ".png", folder="high"))
+
+    make = partial(_make, config)
+    for _ in run_jobs(make, jobs, workers=workers, label="normal maps", units=_length, finished=finished):
         pass
     _template.cache_clear()
     maps = [stage.frame_path(frame_id, ".png", folder=folder) for folder in ("low", "high") for frame_id in frame_ids]
@@ -96,7 +100,8 @@ def _make(config: PairConfig, job: _Run) -> int:
 
     pairs = frame_pairs(
         template, frame_ids, range(missing[0], missing[-1] + 1),
-        vertices=lambda position: np.array(sequence.vertices[position]), scan=scan, fps=job.fps, config=config.projection,
+        vertices=lambda position: np.array(sequence.vertices[position]), scan=scan, fps=job.fps,
+        config=config.projection,
     )  # fmt: skip
     for pair in pairs:
         _write(job.stage, template, sequence, pair)

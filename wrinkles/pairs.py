@@ -58,7 +58,7 @@ class Batch:
 def split(take: PairTake, *, held_out: float, gap: int) -> tuple[PairTake, PairTake]:
     """The start of a take for training, and its end, some frames later, held out."""
     count = len(take.frame_ids)
-    tail = max(int(round(held_out * count)), 1) if held_out > 0 else 0
+    tail = max(round(held_out * count), 1) if held_out > 0 else 0
     gap = min(gap, count // 10) if tail else 0
     if count - tail - gap < 2:
         raise InputError(f"{take.name}: expected at least 2 frames to train on, found {count - tail - gap}")
@@ -123,7 +123,10 @@ def _shuffled(count: int, seed: int, epoch: int) -> np.ndarray:
 
 
 def augmented(batch: Batch, config: AugmentationConfig) -> Batch:
-    """Vectors turned about the vertical, all maps of a sample alike; noise on the input. Draws from torch's generator."""
+    """Vectors turned about the vertical, all maps of a sample alike; noise on the input.
+
+    Draws from torch's generator.
+    """
     if config.turn_deg > 0:
         from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 

@@ -1,8 +1,8 @@
 """Seams of a map: where two islands show the same edge of the cloth, they shall show it alike.
 
 Networks paint the two sides apart. Each side is moved half way to the other at the seam, and less with the distance
-from it; a map that is continuous on the surface stays as it is. Works on maps in one global space, not in tangent space,
-where the two sides have different frames.
+from it; a map that is continuous on the surface stays as it is. Works on maps in one global space, not in tangent
+space, where the two sides have different frames.
 """
 
 from __future__ import annotations

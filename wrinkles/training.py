@@ -39,8 +39,8 @@ def new_state(config: WrinkleConfig) -> TrainingState:
     torch.manual_seed(config.seed)
     layers = config.network.layers
     if config.texels % 2**layers:
-        raise InputError(f"network.layers: expected at most {config.texels.bit_length() - 1} for maps of {config.texels} "
-                         f"texels, found {layers}")  # fmt: skip
+        most = config.texels.bit_length() - 1
+        raise InputError(f"network.layers: expected at most {most} for maps of {config.texels} texels, found {layers}")
     generator = UNet(config.network).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     discriminator = PatchDiscriminator(config.network).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     settings = config.schedule

@@ -78,9 +78,7 @@ class _Row:
     model_mb: float
 
 
-def run(
-    work: Path, model: Path, config: CompareConfig = CompareConfig(), *, workers: int = 1, overwrite: bool = False
-) -> Path:
+def run(work: Path, model: Path, config: CompareConfig, *, workers: int = 1, overwrite: bool = False) -> Path:
     """Learn the baselines, measure, draw; the path of the page.
 
     Args:
