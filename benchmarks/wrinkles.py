@@ -223,9 +223,10 @@ def _milliseconds(config: WrinkleConfig, repeats: int, threads: int) -> float:
     """Median wall time of one map, batch 1, not amortised; fresh weights cost what trained ones do."""
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
-    model = WrinkleModel(UNet(config.network), config.network, texels=config.texels, map_size=config.texels,
-                         layout_digest="")  # fmt: skip
-    low = torch.nn.functional.normalize(torch.randn(3, config.texels, config.texels), dim=0)
+    network = UNet(config.network).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+    size = config.texels
+    model = WrinkleModel(network, config.network, texels=size, map_size=size, layout_digest="")
+    low = torch.nn.functional.normalize(torch.randn(3, size, size), dim=0)
     times = []
     for _ in range(repeats + 1):
         begin = time.perf_counter()

@@ -48,9 +48,17 @@ class TangentLayout:
         return connected_components(self._group.astype(np.int32), self._groups)[self._group[:, 0]]
 
     def tangents(
-        self, vertices: Float[np.ndarray, "V 3"], normals: Float[np.ndarray, "V 3"]
+        self,
+        vertices: Float[np.ndarray, "V 3"],
+        normals: Float[np.ndarray, "V 3"],
+        *,
+        fallback: Float[np.ndarray, "V 3"] | None = None,
     ) -> Float64[np.ndarray, "F 3 3"]:
-        """Unit tangents of the face corners, orthogonal to the vertex normals."""
+        """Unit tangents of the face corners, orthogonal to the vertex normals.
+
+        Args:
+            fallback: directions across the normals where the faces around a vertex have no area; any if None.
+        """
         corners = vertices.astype(np.float64)[self.faces]
         edges = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=1)
         flat = np.einsum("fe,fec->fc", self._of_edges, edges)
@@ -69,7 +77,8 @@ class TangentLayout:
         mean = total[self._group]
         mean -= np.einsum("fkc,fkc->fk", mean, normal)[..., None] * normal
         lost = np.linalg.norm(mean, axis=-1, keepdims=True) < 1e-9
-        return _unit(np.where(lost, _some_orthogonal(normal), mean))
+        instead = _some_orthogonal(normal) if fallback is None else fallback[self.faces]
+        return _unit(np.where(lost, instead, mean))
 
 
 def corner_tangents(

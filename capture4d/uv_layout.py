@@ -19,8 +19,9 @@ from capture4d.types import Mesh
 __all__ = ["Layout", "millimetres_per_texel", "pack_islands", "unit_square"]
 
 Layout = Literal["auto", "keep", "pack"]
-METRIC_TOLERANCE = 0.15
-"""UVs whose lengths are those of the mesh, give or take this share, are a pattern in metres."""
+METRIC_TOLERANCE = 0.35
+"""UVs whose lengths are those of the mesh, give or take this share, are a pattern in metres: the mesh may lie stretched
+on another body."""
 CANDIDATES = 240
 
 

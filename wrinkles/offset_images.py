@@ -121,8 +121,11 @@ class OffsetLayout:
             case "local":
                 normals = np.einsum("vk,vkc->vc", weights, vertex_normals(skinned, faces)[corners])[self.vertex]
                 normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+                # cloth shrunk to a point has no direction of its own; the edge of its body face turns with the body
+                edge = (skinned[corners[:, 1]] - skinned[corners[:, 0]])[self.vertex]
+                across = edge - np.einsum("pc,pc->p", edge, normals)[:, None] * normals
                 tangents = np.empty_like(points)
-                tangents[self.faces] = self.tangents.tangents(points, normals)
+                tangents[self.faces] = self.tangents.tangents(points, normals, fallback=across)
                 frames = interpolated_frames(normals, tangents, np.ones(len(points)))
                 return Anchors(points, frames.transpose(0, 2, 1))
             case "root_offset":

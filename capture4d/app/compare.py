@@ -98,7 +98,7 @@ def run(work: Path, model: Path, config: CompareConfig, *, workers: int = 1, ove
     template = MapTemplate.create(sequence.garment, MapConfig(size=generator.map_size))
     pairs = load_pairs(work)
     held_out, gap = _model_split(model, work, config)
-    held = split(pairs, held_out=held_out, gap=gap)[1]
+    learned, held = split(pairs, held_out=held_out, gap=gap)
     first = len(pairs.frame_ids) - len(held.frame_ids)
     rows = range(first, len(pairs.frame_ids))
     methods = [_registered(template, sequence, rows)]
@@ -112,7 +112,7 @@ def run(work: Path, model: Path, config: CompareConfig, *, workers: int = 1, ove
     )  # fmt: skip
     moving = _moving(work, capture)
     if moving is not None and sequence.garment.skin_weights is not None:
-        methods += _offset_methods(template, sequence, *moving, rows, max(first - gap, 1), config)
+        methods += _offset_methods(template, sequence, *moving, rows, len(learned.frame_ids), config)
     truth = _true_vertices(capture, held.frame_ids)
     table = [_measure(method, template, held, truth, methods[0]) for method in methods]
     chosen = np.unique(np.linspace(0, len(held.frame_ids) - 1, min(config.pictures, len(rows))).astype(int))
