@@ -47,12 +47,12 @@ class Anchors:
 
 
 def encode(anchors: Anchors, cloth: Float[np.ndarray, "P 3"]) -> Float64[np.ndarray, "P 3"]:
-    """Offsets of cloth pixels, metres: R^T (x - p). J3."""
+    """Offsets of cloth pixels, metres: R^T (x - p)."""
     return np.einsum("pca,pc->pa", anchors.axes, cloth - anchors.points)
 
 
 def decode(anchors: Anchors, offsets: Float[np.ndarray, "P 3"]) -> Float64[np.ndarray, "P 3"]:
-    """Positions of cloth pixels: p + R dx. J4."""
+    """Positions of cloth pixels: p + R dx."""
     return anchors.points + np.einsum("pca,pa->pc", anchors.axes, offsets)
 
 
@@ -109,7 +109,7 @@ class OffsetLayout:
         return np.stack([raster.image(np.ones(len(raster.texels), bool)) for raster in self.rasters], axis=-1)
 
     def anchors(self, body: PosedBody, space: OffsetSpace = "local") -> Anchors:
-        """Where offsets start in a pose. J2, J5."""
+        """Where offsets start in a pose."""
         garment, faces = self.garment, body.shaped.body.template.faces
         assert garment.embedding_faces is not None
         assert garment.embedding_barycentric is not None
@@ -138,7 +138,7 @@ class OffsetLayout:
                 assert_never(space)
 
     def draw(self, offsets: Float[np.ndarray, "P 3"]) -> Float32[np.ndarray, "size size 6"]:
-        """The two images of pixel values, side by side in their channels. J6, J8."""
+        """The two images of pixel values, side by side in their channels."""
         images = [raster.image(raster.at_vertices(offsets).astype(np.float32)) for raster in self.rasters]
         return np.concatenate(images, axis=-1)
 
@@ -151,7 +151,12 @@ class OffsetLayout:
 
 
 class OffsetSampler(nn.Module):
-    """Images back to cloth pixels and vertices, differentiable. J7."""
+    """Images back to cloth pixels and vertices, differentiable."""
+
+    grid: Tensor
+    vertex: Tensor
+    front: Tensor
+    uses: Tensor
 
     def __init__(self, layout: OffsetLayout) -> None:
         super().__init__()

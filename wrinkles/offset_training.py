@@ -115,7 +115,7 @@ def grid_loss(
     mask: Bool[Tensor, "2 size size"],
     norm: Literal["l1", "l2"],
 ) -> Float[Tensor, ""]:
-    """J29: the mean over the texels of both images of the length of the difference."""
+    """The mean over the texels of both images of the length of the difference."""
     difference = (made - truth).unflatten(1, (2, 3))
     length = difference.abs().sum(dim=2) if norm == "l1" else difference.norm(dim=2)
     return (length * mask).sum() / (mask.sum() * len(made))
@@ -124,7 +124,7 @@ def grid_loss(
 def normal_loss(
     made: Float[Tensor, "B V 3"], truth: Float[Tensor, "B V 3"], faces: Int[Tensor, "F 3"]
 ) -> Float[Tensor, ""]:
-    """J30: the mean over the vertices of 1 - cos of the angle between the normals."""
+    """The mean over the vertices of 1 - cos of the angle between the normals."""
     return (1 - (_vertex_normals(made, faces) * _vertex_normals(truth, faces)).sum(dim=-1)).mean()
 
 

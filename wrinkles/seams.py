@@ -47,7 +47,9 @@ def seam_table(mesh: Mesh, raster: UvRaster, *, reach: float = 6.0) -> SeamTable
     if not len(own):
         none = np.zeros((0, 2))
         return SeamTable(np.zeros(0, np.int64), none[:, 0], none, none)
-    distance, nearest = KDTree(own).query(centres, distance_upper_bound=reach / raster.size)
+    distance, nearest = (
+        np.asarray(each) for each in KDTree(own).query(centres, distance_upper_bound=reach / raster.size)
+    )
     near = np.flatnonzero(np.isfinite(distance))
     weight = 1 - distance[near] * raster.size / reach
     # Padding repeats the border, so it is moved as far as the border is.

@@ -44,11 +44,11 @@ def new_state(config: WrinkleConfig) -> TrainingState:
     generator = UNet(config.network).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     discriminator = PatchDiscriminator(config.network).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     settings = config.schedule
-    optimizers = [
-        torch.optim.Adam(network.parameters(), lr=settings.learning_rate, betas=(settings.beta1, 0.999))
-        for network in (generator, discriminator)
-    ]
-    return TrainingState(generator, discriminator, *optimizers)
+
+    def adam(network: nn.Module) -> torch.optim.Adam:
+        return torch.optim.Adam(network.parameters(), lr=settings.learning_rate, betas=(settings.beta1, 0.999))
+
+    return TrainingState(generator, discriminator, adam(generator), adam(discriminator))
 
 
 def train_step(state: TrainingState, batch: Batch, config: WrinkleConfig) -> dict[str, float]:
