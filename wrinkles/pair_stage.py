@@ -19,12 +19,12 @@ from capture4d.garment_stage import load_garment_scan
 from capture4d.records import save_garment
 from capture4d.registered_takes import failed_frames, load_registration, registered_digest, work_capture
 from capture4d.types import Mesh, RegisteredSequence
-from capture4d.workdir import Stage, open_stage, require_complete, run_jobs, write_bytes, write_json
+from capture4d.workdir import Stage, open_stage, read_json, require_complete, run_jobs, write_bytes, write_json
 from wrinkles.config import PairConfig
 from wrinkles.map_spaces import encode_png
 from wrinkles.normal_maps import FramePair, MapTemplate, frame_pairs
 
-__all__ = ["run"]
+__all__ = ["ensure_pairs", "run"]
 
 SCHEMA = 1
 RUN_FRAMES = 24
@@ -72,6 +72,15 @@ def run(work: Path, config: PairConfig, *, workers: int = 1, overwrite: bool = F
     _template.cache_clear()
     maps = [stage.frame_path(frame_id, ".png", folder=folder) for folder in ("low", "high") for frame_id in frame_ids]
     return stage.finish([output / "template.npz", *maps])
+
+
+def ensure_pairs(work: Path, config: PairConfig, *, workers: int = 1) -> None:
+    """Make a work folder's pairs, unless it has finished ones of its present registration, whatever their settings."""
+    record_path = work / "wrinkles" / "pairs" / "stage.json"
+    record = read_json(record_path) if record_path.is_file() else {}
+    finished = record.get("status") == "complete"
+    if not finished or record["upstream"].get("registration") != registered_digest(work):
+        run(work, config, workers=workers)
 
 
 def _length(job: _Run) -> int:

@@ -28,6 +28,7 @@ from wrinkles.inference import WrinkleModel, model_bytes
 from wrinkles.map_metrics import MapScores, score
 from wrinkles.map_spaces import to_colours
 from wrinkles.pair_files import layout_digest, load_pairs, pair_template
+from wrinkles.pair_stage import ensure_pairs
 from wrinkles.pair_stage import run as make_pairs
 from wrinkles.pairs import PairTake, batches, fitted, split
 from wrinkles.training import TrainingState, load_tensors, new_state, state_tensors, train_step
@@ -50,6 +51,8 @@ def run(
 ) -> str:
     """Make the pairs that are missing, train, measure; the digest of the result.
 
+    Pairs that are there are used as they are, unless `pairs` asks for other than the default.
+
     Equal inputs, settings and numbers of `workers`, which are torch's threads here, give equal weights, however often
     the run was interrupted.
 
@@ -59,7 +62,10 @@ def run(
     if not works:
         raise InputError("wrinkles train: expected at least one work folder, found none")
     for work in works:
-        make_pairs(work, pairs or PairConfig(), workers=workers)
+        if pairs is None or pairs == PairConfig():
+            ensure_pairs(work, PairConfig(), workers=workers)
+        else:
+            make_pairs(work, pairs, workers=workers)
     upstream = {
         work.name: require_complete(work / "wrinkles" / "pairs", "pairs", f"capture4d wrinkles maps {work}")
         for work in works

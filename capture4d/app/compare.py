@@ -24,6 +24,7 @@ from capture4d.app.compare_config import CompareConfig
 from capture4d.app.render import Drawn, heat_colours, render
 from capture4d.app.report_pictures import HEIGHT, WIDTH, Framing, Panel, colour_bar, data_uri
 from capture4d.body_stage import load_tracking
+from capture4d.errors import InputError
 from capture4d.evaluation import correspondence_errors, material_points
 from capture4d.registered_takes import load_registration, registered_digest, work_capture
 from capture4d.scans import Capture, read_body, read_poses, read_scan, read_truth_model, read_truth_vertices
@@ -40,8 +41,8 @@ from wrinkles.normal_maps import MapTemplate
 from wrinkles.offset_images import OffsetLayout, OffsetSampler
 from wrinkles.offset_networks import ImageDecoder, PcaFullyConnected
 from wrinkles.offset_training import OffsetConfig, OffsetFrames, offset_frames, pose_joints, predict, train_offsets
-from wrinkles.pair_files import load_pairs
-from wrinkles.pair_stage import run as make_pairs
+from wrinkles.pair_files import layout_digest, load_pairs
+from wrinkles.pair_stage import ensure_pairs
 from wrinkles.pairs import PairTake, split
 from wrinkles.seams import seam_table
 
@@ -88,7 +89,7 @@ def run(work: Path, model: Path, config: CompareConfig, *, workers: int = 1, ove
     """
     weights = model / "generator.safetensors" if model.is_dir() else model
     generator = load_model(str(weights))
-    make_pairs(work, PairConfig(map=MapConfig(size=generator.map_size)), workers=workers)
+    ensure_pairs(work, PairConfig(map=MapConfig(size=generator.map_size)), workers=workers)
     upstream = {"registration": registered_digest(work), "model": file_digest([weights], root=weights.parent)}
     stage = open_stage(
         work / "compare", name="compare", schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite
@@ -96,7 +97,12 @@ def run(work: Path, model: Path, config: CompareConfig, *, workers: int = 1, ove
     torch.set_num_threads(workers)
     capture, sequence = work_capture(work), load_registration(work / "registration")
     template = MapTemplate.create(sequence.garment, MapConfig(size=generator.map_size))
+    if layout_digest(template.mesh, generator.map_size) != generator.layout_digest:
+        raise InputError(f"{work}: expected the template that {weights} was trained on, found another")
     pairs = load_pairs(work)
+    if pairs.low.shape[-1] != generator.map_size:
+        raise InputError(f"{work}: expected pairs of {generator.map_size} texels, as {weights} has them, found "
+                         f"{pairs.low.shape[-1]}")  # fmt: skip
     held_out, gap = _model_split(model, work, config)
     learned, held = split(pairs, held_out=held_out, gap=gap)
     first = len(pairs.frame_ids) - len(held.frame_ids)
