@@ -145,9 +145,7 @@ def run(
         Metric("ssim", float(np.mean([each.ssim for each in made])), "", "higher"),
         *_cell_metrics(cells),
         *(
-            Metric(
-                f"normal_error_{kind}_norm_deg", float(np.mean([each[kind] for each in eval_errors.values()])), "deg"
-            )
+            Metric(f"normal_error_{kind}_norm_deg", float(np.mean([each[kind] for each in evidence])), "deg")
             for kind in ("running", "instance")
         ),
         Metric("ms_per_map_paper", _milliseconds(PRESETS["paper"], 3 if quick else 15, workers), "ms"),
