@@ -50,14 +50,14 @@ def run(*, quick: bool = False, frames: int = 24, workers: int = 2) -> list[Metr
     """Measure pairs of two takes.
 
     Args:
-        quick: eight frames of a small take with a coarse scanner, the same keys.
+        quick: six frames of a small take with a coarse scanner, the same keys.
         frames: of each take.
     """
     rows: list[_Row] = []
     cpu_s, mm_per_texel = [], []
     for config in (QUICK_TAKE,) if quick else tuple(PRESETS[name] for name in TAKES):
         capture, work = registered_work(config, workers=workers)
-        measured, seconds, millimetres = _measure(capture, work, 8 if quick else frames)
+        measured, seconds, millimetres = _measure(capture, work, RUN if quick else frames)
         rows += measured
         cpu_s.append(seconds)
         mm_per_texel.append(millimetres)

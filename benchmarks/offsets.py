@@ -60,7 +60,7 @@ def run(
         size: texels along the side of the images that are learned.
     """
     if quick:
-        works, epochs, size = (registered_work(QUICK_TAKE, workers=workers)[1],), 20, 64
+        works, epochs, size = (registered_work(QUICK_TAKE, workers=workers)[1],), 200, 64
         tests: tuple[Path, ...] = works
     elif not (train and test):
         raise InputError("benchmarks offsets: expected --train and --test with work folders, or --quick")
@@ -96,6 +96,7 @@ def run(
     baseline = vertex_errors_cm(sampler.positions(mean, tested.points, tested.axes), tested.vertices)
     return [
         Metric("image_floor_mm", CM_IN_MM * _floor_cm(floor, works[0], joints), "mm"),
+        Metric("image_floor_uncorrected_mm", CM_IN_MM * _floor_cm(floor, works[0], joints, corrections=0), "mm"),
         *(Metric(f"{name}_test_cm", each.test_cm, "cm") for name, each in errors.items()),
         *(Metric(f"{name}_train_cm", each.train_cm, "cm") for name, each in errors.items()),
         Metric("mean_baseline_cm", baseline, "cm", "higher"),
@@ -151,12 +152,12 @@ def _errors(
     )
 
 
-def _floor_cm(layout: OffsetLayout, work: Path, joints: np.ndarray) -> float:
+def _floor_cm(layout: OffsetLayout, work: Path, joints: np.ndarray, *, corrections: int = 3) -> float:
     """Error of a round trip through images, without any network."""
     frames, sampler = _frames(layout, work, joints), OffsetSampler(layout)
     errors = []
     for row in range(0, len(frames), max(len(frames) // 8, 1)):
         one = frames.rows([row])
-        images = torch.from_numpy(layout.draw(one.offsets[0].numpy())).permute(2, 0, 1)[None]
+        images = torch.from_numpy(layout.draw(one.offsets[0].numpy(), corrections=corrections)).permute(2, 0, 1)[None]
         errors.append(vertex_errors_cm(sampler.positions(sampler(images), one.points, one.axes), one.vertices))
     return float(np.mean(errors))

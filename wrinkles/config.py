@@ -44,7 +44,7 @@ class ProjectionConfig:
     """Nor does one that faces another way by more than this."""
     border_rings: int = 1
     """Rings of scan vertices along open borders, beyond the border itself, that are not trusted; 0 trusts all."""
-    smoothing_passes: int = 2
+    smoothing_passes: int = 1
     """Steps of half-way averaging of the scan's normals with their neighbours'."""
     temporal_frames: int = 3
     """Frames averaged in tangent space, an odd number."""
