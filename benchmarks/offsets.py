@@ -60,7 +60,7 @@ def run(
         size: texels along the side of the images that are learned.
     """
     if quick:
-        works, epochs, size = (registered_work(QUICK_TAKE, workers=workers)[1],), 200, 64
+        works, epochs, size = (registered_work(QUICK_TAKE, workers=workers)[1],), 60, 64
         tests: tuple[Path, ...] = works
     elif not (train and test):
         raise InputError("benchmarks offsets: expected --train and --test with work folders, or --quick")
