@@ -17,7 +17,7 @@ from capture4d.body_anny import load_anny
 from capture4d.body_stage import load_tracking
 from capture4d.errors import InputError
 from capture4d.records import load_garment
-from capture4d.scans import read_body, read_capture, read_poses
+from capture4d.scans import Capture, read_body, read_capture, read_poses
 from capture4d.types import Body, PoseSequence, RegisteredSequence
 from capture4d.workdir import Stage, read_json, write_npy_rows
 
@@ -26,11 +26,14 @@ __all__ = [
     "REGISTER",
     "VERDICTS",
     "capture_path",
+    "failed_frames",
     "is_animated",
     "load_moving_body",
     "load_records",
     "load_registration",
+    "registered_digest",
     "stack_vertices",
+    "work_capture",
 ]
 
 VERDICTS = ("good", "check", "failed")
@@ -67,6 +70,30 @@ def load_records(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
 
 
+def failed_frames(work: Path) -> set[int]:
+    """Frames whose registration failed; empty where nobody graded them."""
+    folder = work / "registration"
+    if not (folder / "metrics.jsonl").is_file():
+        return set()
+    return {record["frame_id"] for record in load_records(folder) if record.get("verdict") == "failed"}
+
+
+def registered_digest(work: Path) -> str:
+    """The digest of WORK/registration, whichever stage made it.
+
+    Raises:
+        InputError: there is none, or it is unfinished.
+    """
+    record_path = work / "registration" / "stage.json"
+    if not record_path.is_file():
+        raise InputError(f"{work}: expected a work folder with a registration, found none; run: capture4d run CAPTURE "
+                         f"--output {work}")  # fmt: skip
+    record = read_json(record_path)
+    if record.get("status") != "complete":
+        raise InputError(f"{work / 'registration'}: '{record.get('stage')}' is not finished; run its command again")
+    return record["digest"]
+
+
 def is_animated(work: Path) -> bool:
     """Whether the sequence comes from a model, not from scans."""
     record = work / "registration" / "stage.json"
@@ -85,6 +112,18 @@ def capture_path(work: Path) -> Path:
         if candidate is not None and (Path(candidate) / "capture.json").is_file():
             return Path(candidate)
     raise InputError(f"{work}: expected the capture at {recorded or work / 'capture'}, found none there")
+
+
+def work_capture(work: Path) -> Capture:
+    """The capture a work folder was made from.
+
+    Raises:
+        InputError: there are no scans' garments, or the capture is not where it was.
+    """
+    if not (work / "garment" / "stage.json").is_file():
+        raise InputError(f"{work}: expected the scans' garments of 'extract', found none; run: capture4d extract "
+                         f"CAPTURE --output {work}")  # fmt: skip
+    return read_capture(capture_path(work))
 
 
 def load_moving_body(work: Path) -> tuple[Body, PoseSequence]:

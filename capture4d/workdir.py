@@ -37,6 +37,7 @@ __all__ = [
     "WorkerDied",
     "file_digest",
     "open_stage",
+    "progress",
     "read_json",
     "require_complete",
     "run_jobs",
@@ -345,7 +346,7 @@ def run_jobs(
     if not jobs:
         return
     total = sum(units(job) if units else 1 for job in jobs)
-    with _progress(label, total, finished) as advance:
+    with progress(label, total, finished) as advance:
         if workers <= 1 or len(jobs) <= 1:
             for job in jobs:
                 result = function(job)
@@ -412,7 +413,15 @@ def _start_worker() -> None:
 
 
 @contextlib.contextmanager
-def _progress(label: str, total: int, finished: Callable[[], int] | None) -> Iterator[Callable[[int], None]]:
+def progress(
+    label: str, total: int, finished: Callable[[], int] | None = None, *, completed: int = 0
+) -> Iterator[Callable[[int], None]]:
+    """A progress bar with the time left, on stderr; call what it yields with the units just done.
+
+    Args:
+        finished: units done so far, read from disk once a second, instead of calls.
+        completed: units that were done before.
+    """
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -432,19 +441,19 @@ def _progress(label: str, total: int, finished: Callable[[], int] | None) -> Ite
         TimeRemainingColumn(),
     )
     stop = threading.Event()
-    with Progress(*columns, console=Console(stderr=True)) as progress:
-        task = progress.add_task(label, total=total)
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+        task = bar.add_task(label, total=total, completed=completed)
         before = finished() if finished else 0
 
         def poll() -> None:
             while finished and not stop.wait(1.0):
-                progress.update(task, completed=min(finished() - before, total))
+                bar.update(task, completed=min(finished() - before, total))
 
         poller = threading.Thread(target=poll, daemon=True)
         poller.start()
         try:
-            yield lambda count: None if finished else progress.advance(task, count)
-            progress.update(task, completed=total)
+            yield lambda count: None if finished else bar.advance(task, count)
+            bar.update(task, completed=total)
         finally:
             stop.set()
             poller.join()

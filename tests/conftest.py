@@ -17,6 +17,7 @@ _COMMANDS = (
     "model_commands",
     "stage_commands",
     "synthesis_commands",
+    "wrinkle_commands",
 )
 _UNCHECKED = {"capture4d.app.cli", *(f"capture4d.app.{name}" for name in _COMMANDS)}
 

@@ -21,9 +21,11 @@ from capture4d.app.file_commands import ConvertBody, ConvertPoses, ConvertRig, R
 from capture4d.app.model_commands import Animate, Fit
 from capture4d.app.stage_commands import Extract, Register, Report, Run, Track
 from capture4d.app.synthesis_commands import Demo, Scan, Synth
+from capture4d.app.wrinkle_commands import Compare, WrinklesApply, WrinklesMaps, WrinklesTrain
 from capture4d.errors import InputError
 from data_synth import config as synth_config
 from registration import config as registration_config
+from wrinkles import config as wrinkle_config
 
 __all__ = ["main"]
 
@@ -52,6 +54,10 @@ _COMMANDS: Mapping[str, Any] = {
     "report": Report,
     "fit": Fit,
     "animate": Animate,
+    "wrinkles maps": WrinklesMaps,
+    "wrinkles train": WrinklesTrain,
+    "wrinkles apply": WrinklesApply,
+    "compare": Compare,
     "register-mesh": RegisterMesh,
     "calibrate": Calibrate,
     "check-rig": CheckRig,
@@ -64,6 +70,7 @@ _PRESETS: Mapping[Any, Mapping[str, Any]] = {
     Synth: synth_config.PRESETS,
     Register: registration_config.PRESETS,
     Run: registration_config.PRESETS,
+    WrinklesTrain: wrinkle_config.PRESETS,
 }
 
 
@@ -111,6 +118,11 @@ def _dispatch(arguments: list[str]) -> int:
         print(f"capture4d {version('capture4d')}")
         return 0
     name, *rest = arguments
+    if any(command.startswith(f"{name} ") for command in _COMMANDS):  # a group, such as `wrinkles train`
+        if not rest or rest[0] in ("-h", "--help"):
+            print(_overview(f"{name} "))
+            return 0 if rest else 2
+        name, rest = f"{name} {rest[0]}", rest[1:]
     if name not in _COMMANDS:
         near = difflib.get_close_matches(name, _COMMANDS, n=1)
         hint = f"; did you mean '{near[0]}'?" if near else ""
@@ -144,8 +156,12 @@ def _value_of(option: str, arguments: list[str]) -> str | None:
     return None
 
 
-def _overview() -> str:
-    lines = [f"  {name:<15}{(command.__doc__ or '').splitlines()[0]}" for name, command in _COMMANDS.items()]
+def _overview(group: str = "") -> str:
+    lines = [
+        f"  {name:<15} {(command.__doc__ or '').splitlines()[0]}"
+        for name, command in _COMMANDS.items()
+        if name.startswith(group)
+    ]
     return "\n".join(
         [
             "usage: capture4d COMMAND ...",

@@ -11,7 +11,9 @@ from jaxtyping import Float, Float32, Int, Int32, UInt8
 
 from capture4d.mesh import vertex_normals
 from capture4d.open3d_loading import import_open3d
+from capture4d.tangents import TangentLayout, interpolated_frames
 from capture4d.types import Mesh
+from capture4d.uv_raster import sample_bilinear
 
 __all__ = ["Direction", "Drawn", "Traced", "View", "frame_view", "heat_colours", "render", "trace"]
 
@@ -66,6 +68,8 @@ class Drawn:
     mesh: Mesh
     colours: UInt8[np.ndarray, "verts 3"] | tuple[int, int, int] = (200, 198, 194)
     """sRGB, per vertex or one for all."""
+    normal_map: Float32[np.ndarray, "size size 3"] | None = None
+    """Tangent-space normals, OpenGL's +Y, row 0 at v = 1; needs UVs in the unit square."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,12 +141,24 @@ def render(
     background: tuple[int, int, int] = (255, 255, 255),
 ) -> UInt8[np.ndarray, "height width 3"]:
     """A picture of meshes, row 0 on top."""
-    traced = trace([item.mesh for item in drawn], view, width=width, height=height)
+    maps = [item.normal_map for item in drawn]
+    traced = trace([item.mesh for item in drawn], view, width=width, height=height, normal_maps=maps)
     return traced.painted([item.colours for item in drawn], background=background)
 
 
-def trace(meshes: Sequence[Mesh], view: View, *, width: int, height: int) -> Traced:
-    """Find what every pixel sees, to be painted once or several times."""
+def trace(
+    meshes: Sequence[Mesh],
+    view: View,
+    *,
+    width: int,
+    height: int,
+    normal_maps: Sequence[Float32[np.ndarray, "size size 3"] | None] | None = None,
+) -> Traced:
+    """Find what every pixel sees, to be painted once or several times.
+
+    Args:
+        normal_maps: tangent-space normals for each mesh, or None for its own.
+    """
     o3d = import_open3d()
     scene = o3d.t.geometry.RaycastingScene()
     normals, faces, first_vertex, first_face = [np.zeros((0, 3))], [np.zeros((0, 3), np.int32)], 0, [0]
@@ -165,6 +181,12 @@ def trace(meshes: Sequence[Mesh], view: View, *, width: int, height: int) -> Tra
     second_third = answer["primitive_uvs"].numpy()[hit]
     weights = np.column_stack([1 - second_third.sum(axis=1), second_third])
     normal = np.einsum("nk,nkc->nc", weights, np.concatenate(normals)[corners])
+    first = 0
+    for mesh, normal_map in zip(meshes, normal_maps or [None] * len(meshes), strict=True):
+        if normal_map is not None:
+            seen = (face >= first) & (face < first + len(mesh.faces))
+            normal[seen] = _mapped(mesh, normal_map, face[seen] - first, weights[seen], normal[seen])
+        first += len(mesh.faces)
     light = _shade(normal, rays[hit, 3:], view).astype(np.float32)
     return Traced((height, width), counts, hit, corners, weights, light)
 
@@ -202,6 +224,19 @@ class Traced:
             picture[self.hit] = colour * self.light[:, None]
         samples = picture.reshape(height, SUPERSAMPLING, width, SUPERSAMPLING, 3)
         return _encoded(samples.mean(axis=(1, 3)))
+
+
+def _mapped(
+    mesh: Mesh, normal_map: np.ndarray, faces: np.ndarray, weights: np.ndarray, normals: np.ndarray
+) -> np.ndarray:
+    """World normals that a tangent-space map gives to points of a mesh."""
+    if mesh.uv is None:
+        raise ValueError("normal_map: expected a mesh with UVs")
+    layout = TangentLayout(mesh.faces, mesh.uv)
+    tangents = layout.tangents(mesh.vertices, vertex_normals(mesh.vertices.astype(float), mesh.faces))[faces]
+    frames = interpolated_frames(normals, np.einsum("nk,nkc->nc", weights, tangents), layout.sign[faces])
+    uv = np.einsum("nk,nkc->nc", weights, mesh.uv[faces])
+    return np.einsum("nrc,nr->nc", frames, sample_bilinear(normal_map, uv))
 
 
 def _rays(view: View, rows: int, columns: int) -> Float32[np.ndarray, "rays 6"]:

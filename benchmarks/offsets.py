@@ -1,0 +1,163 @@
+"""Offset images predicted from pose, beside fully connected baselines, on held-out frames.
+
+Limits this was built against: `image_floor_mm` 0.3 (a round trip through images of 256 texels),
+`decoder_to_mean_baseline` 0.6, and the baseline with PCA better than without.
+
+The paper prints, in cm, training / test (Jin et al., Tables 1 and 2; 20,011 simulated poses): decoder with L2 and
+normal loss 0.37 / 0.51, fully connected 0.65 / 0.67, with 128 components 0.50 / 0.55.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import nn
+
+from benchmarks.metric import Metric
+from benchmarks.registered_work import QUICK_TAKE, registered_work
+from capture4d.errors import InputError
+from capture4d.scans import read_body, read_poses
+from capture4d.work_folder import load_registration, work_capture
+from wrinkles.offset_images import OffsetLayout, OffsetSampler
+from wrinkles.offset_networks import FullyConnected, ImageDecoder, PcaFullyConnected
+from wrinkles.offset_training import (
+    OffsetConfig,
+    OffsetFrames,
+    offset_frames,
+    pose_joints,
+    predict,
+    train_offsets,
+    vertex_errors_cm,
+)
+
+CM_IN_MM = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Errors:
+    train_cm: float
+    test_cm: float
+
+
+def run(
+    *,
+    quick: bool = False,
+    train: tuple[Path, ...] = (),
+    test: tuple[Path, ...] = (),
+    size: int = 256,
+    epochs: int = 60,
+    components: int = 128,
+    workers: int = 2,
+) -> list[Metric]:
+    """Train decoder and baselines on registered frames.
+
+    Args:
+        quick: nine frames of a small take to learn, three to test; images of 64 texels are learned, 256 measured.
+        train, test: work folders of one garment and subject; their captures hold the poses.
+        size: texels along the side of the images that are learned.
+    """
+    if quick:
+        works, epochs, size = (registered_work(QUICK_TAKE, workers=workers)[1],), 60, 64
+        tests: tuple[Path, ...] = works
+    elif not (train and test):
+        raise InputError("benchmarks offsets: expected --train and --test with work folders, or --quick")
+    else:
+        works, tests = train, test
+    torch.set_num_threads(workers)
+    garment = load_registration(works[0] / "registration").garment
+    floor = OffsetLayout.create(garment, 256)
+    layout = floor if size == 256 else OffsetLayout.create(garment, size)
+    joints = _joints(works[0])
+    learned = _joined([_frames(layout, work, joints) for work in works])
+    if quick:
+        learned, tested = learned.rows(range(9)), learned.rows(range(9, 12))
+        validation = tested
+    else:
+        tested = _joined([_frames(layout, work, joints) for work in tests])
+        cut = max(len(learned) // 9, 1)  # the paper regularises on a ninth
+        learned, validation = (
+            learned.rows(range(len(learned) - cut)),
+            learned.rows(range(len(learned) - cut, len(learned))),
+        )
+    sampler = OffsetSampler(layout)
+    torch.manual_seed(0)
+    pose_size = learned.pose.shape[1]
+    doublings = size.bit_length() - 4
+    networks = {
+        "decoder": ImageDecoder(pose_size, channels=384 if size == 256 else 32, doublings=doublings),
+        "fc": FullyConnected(pose_size, len(layout.vertex)),
+        "fc_pca": PcaFullyConnected(pose_size, learned.offsets, components=components),
+    }
+    errors = {name: _errors(network, layout, learned, validation, tested, epochs) for name, network in networks.items()}
+    mean = learned.offsets.mean(dim=0).expand(len(tested), -1, -1)
+    baseline = vertex_errors_cm(sampler.positions(mean, tested.points, tested.axes), tested.vertices)
+    return [
+        Metric("image_floor_mm", CM_IN_MM * _floor_cm(floor, works[0], joints), "mm"),
+        Metric("image_floor_uncorrected_mm", CM_IN_MM * _floor_cm(floor, works[0], joints, corrections=0), "mm"),
+        *(Metric(f"{name}_test_cm", each.test_cm, "cm") for name, each in errors.items()),
+        *(Metric(f"{name}_train_cm", each.train_cm, "cm") for name, each in errors.items()),
+        Metric("mean_baseline_cm", baseline, "cm", "higher"),
+        Metric("decoder_to_mean_baseline", errors["decoder"].test_cm / baseline),
+        Metric("fc_pca_to_fc", errors["fc_pca"].test_cm / errors["fc"].test_cm),
+        Metric("frames_train", float(len(learned)), "frames", "higher"),
+        Metric("frames_test", float(len(tested)), "frames", "higher"),
+    ]
+
+
+def _joints(work: Path) -> np.ndarray:
+    poses, garment = read_poses(work_capture(work)), load_registration(work / "registration").garment
+    if poses is None or garment.skin_weights is None:
+        raise InputError(f"{work}: expected a capture with poses, and a template bound to its body")
+    return pose_joints(poses, garment.skin_weights)
+
+
+def _frames(layout: OffsetLayout, work: Path, joints: np.ndarray) -> OffsetFrames:
+    capture, sequence = work_capture(work), load_registration(work / "registration")
+    poses, body = read_poses(capture), read_body(capture)
+    assert poses is not None
+    assert body is not None
+    rows = [poses.frame_ids.tolist().index(frame_id) for frame_id in sequence.frame_ids.tolist()]
+    chosen = type(poses)(
+        poses.rotations[rows],
+        poses.translations[rows],
+        poses.shape,
+        poses.frame_ids[rows],
+        poses.fps,
+        poses.joint_names,
+    )
+    return offset_frames(layout, body, chosen, np.array(sequence.vertices), joints)
+
+
+def _joined(parts: list[OffsetFrames]) -> OffsetFrames:
+    names = OffsetFrames.__dataclass_fields__
+    return OffsetFrames(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})
+
+
+def _errors(
+    network: nn.Module,
+    layout: OffsetLayout,
+    learned: OffsetFrames,
+    validation: OffsetFrames,
+    tested: OffsetFrames,
+    epochs: int,
+) -> _Errors:
+    train_offsets(network, layout, learned, validation, OffsetConfig(epochs=epochs, batch=min(16, len(learned))))
+    sampler = OffsetSampler(layout)
+    return _Errors(
+        vertex_errors_cm(predict(network, sampler, learned), learned.vertices),
+        vertex_errors_cm(predict(network, sampler, tested), tested.vertices),
+    )
+
+
+def _floor_cm(layout: OffsetLayout, work: Path, joints: np.ndarray, *, corrections: int = 3) -> float:
+    """Error of a round trip through images, without any network."""
+    frames, sampler = _frames(layout, work, joints), OffsetSampler(layout)
+    errors = []
+    for row in range(0, len(frames), max(len(frames) // 8, 1)):
+        one = frames.rows([row])
+        images = torch.from_numpy(layout.draw(one.offsets[0].numpy(), corrections=corrections)).permute(2, 0, 1)[None]
+        errors.append(vertex_errors_cm(sampler.positions(sampler(images), one.points, one.axes), one.vertices))
+    return float(np.mean(errors))

@@ -1,0 +1,327 @@
+"""One page that compares what gives a garment its surface, on the same held-out frames: WORK/compare/index.html.
+
+registration        the template as registered, without a map
+network             its maps made by a trained generator
+offset images       vertices decoded from an image that a network predicts from the pose alone, learned here
+fully connected     the same with a fully connected network on principal components
+
+docs/wrinkles.md defines the measures.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import jinja2
+import numpy as np
+import torch
+
+from capture4d.app.compare_config import CompareConfig
+from capture4d.app.render import Drawn, heat_colours, render
+from capture4d.app.report_pictures import HEIGHT, WIDTH, Framing, Panel, colour_bar, data_uri
+from capture4d.body_stage import load_tracking
+from capture4d.errors import InputError
+from capture4d.evaluation import correspondence_errors, material_points
+from capture4d.scans import Capture, read_body, read_poses, read_scan, read_truth_model, read_truth_vertices
+from capture4d.types import Body, PoseSequence, RegisteredSequence
+from capture4d.uv_layout import millimetres_per_texel
+from capture4d.work_folder import load_registration, registered_digest, work_capture
+from capture4d.workdir import file_digest, open_stage, read_json, write_bytes, write_json
+from wrinkles.apply_stage import generated_normals
+from wrinkles.config import MapConfig, PairConfig
+from wrinkles.display import fill_holes
+from wrinkles.inference import load_model
+from wrinkles.map_metrics import angles, score
+from wrinkles.map_spaces import to_tangent
+from wrinkles.normal_maps import MapTemplate
+from wrinkles.offset_images import OffsetLayout, OffsetSampler
+from wrinkles.offset_networks import ImageDecoder, PcaFullyConnected
+from wrinkles.offset_training import OffsetConfig, OffsetFrames, offset_frames, pose_joints, predict, train_offsets
+from wrinkles.pair_files import layout_digest, load_pairs
+from wrinkles.pair_stage import ensure_pairs
+from wrinkles.pairs import PairTake, split
+from wrinkles.seams import seam_table
+
+__all__ = ["run"]
+
+SCHEMA = 1
+ERROR_DEG = 30.0
+"""Normal error at which the strip's colours saturate."""
+MB = 1e6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Method:
+    """A surface for every held-out frame."""
+
+    name: str
+    vertices: np.ndarray
+    """(T, V, 3)."""
+    normals: np.ndarray
+    """(T, N, 3) world, per texel."""
+    ms_per_frame: float
+    megabytes: float
+    has_map: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class _Row:
+    name: str
+    vertex_mm: float | None
+    normal_deg: float | None
+    wrinkle_energy_kept: float | None
+    flicker_deg: float | None
+    ms_per_frame: float
+    model_mb: float
+
+
+def run(work: Path, model: Path, config: CompareConfig, *, workers: int = 1, overwrite: bool = False) -> Path:
+    """Learn the baselines, measure, draw; the path of the page.
+
+    Args:
+        model: folder of `capture4d wrinkles train`.
+    Raises:
+        InputError: the work folder lacks registration or scans, or the model is of another template.
+    """
+    weights = model / "generator.safetensors" if model.is_dir() else model
+    generator = load_model(str(weights))
+    ensure_pairs(work, PairConfig(map=MapConfig(size=generator.map_size)), workers=workers)
+    upstream = {"registration": registered_digest(work), "model": file_digest([weights], root=weights.parent)}
+    stage = open_stage(
+        work / "compare", name="compare", schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite
+    )
+    torch.set_num_threads(workers)
+    capture, sequence = work_capture(work), load_registration(work / "registration")
+    template = MapTemplate.create(sequence.garment, MapConfig(size=generator.map_size))
+    if layout_digest(template.mesh, generator.map_size) != generator.layout_digest:
+        raise InputError(f"{work}: expected the template that {weights} was trained on, found another")
+    pairs = load_pairs(work)
+    if pairs.low.shape[-1] != generator.map_size:
+        raise InputError(f"{work}: expected pairs of {generator.map_size} texels, as {weights} has them, found "
+                         f"{pairs.low.shape[-1]}")  # fmt: skip
+    held_out, gap = _model_split(model, work, config)
+    learned, held = split(pairs, held_out=held_out, gap=gap)
+    first = len(pairs.frame_ids) - len(held.frame_ids)
+    rows = range(first, len(pairs.frame_ids))
+    methods = [_registered(template, sequence, rows)]
+    seams = seam_table(template.mesh, template.raster)
+    methods.append(
+        _drawn_by(
+            "network", template, methods[0].vertices,
+            lambda vertices: generated_normals(generator, template, seams, vertices),
+            _megabytes(generator.generator),
+        )
+    )  # fmt: skip
+    moving = _moving(work, capture)
+    if moving is not None and sequence.garment.skin_weights is not None:
+        methods += _offset_methods(template, sequence, *moving, rows, len(learned.frame_ids), config)
+    truth = _true_vertices(capture, held.frame_ids)
+    table = [_measure(method, template, held, truth, methods[0]) for method in methods]
+    chosen = np.unique(np.linspace(0, len(held.frame_ids) - 1, min(config.pictures, len(rows))).astype(int))
+    frames = [
+        (
+            int(held.frame_ids[at]),
+            _pictures(capture, template, methods, held, int(at)),
+            _strip(template, methods, held, int(at)),
+        )
+        for at in chosen
+    ]
+    write_json(stage.path / "compare.json", {"frames": held.frame_ids, "methods": [asdict(row) for row in table]})
+    environment = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True)
+    page = environment.get_template("compare.html.jinja").render(
+        name=capture.name, rows=table, frames=frames, count=len(held.frame_ids), against_truth=truth is not None,
+        error_deg=ERROR_DEG, bar=colour_bar(ERROR_DEG),
+    )  # fmt: skip
+    write_bytes(stage.path / "index.html", page.encode())
+    stage.finish([stage.path / "index.html"])
+    return stage.path / "index.html"
+
+
+def _model_split(model: Path, work: Path, config: CompareConfig) -> tuple[float, int]:
+    """The frames a network has not seen: its own split where it learned from this take."""
+    record_path = model / "stage.json"
+    record = read_json(record_path) if record_path.is_file() else {}
+    learned = record.get("config", {})
+    if work.name in record.get("upstream", {}) and learned.get("held_out", 0) > 0:
+        return float(learned["held_out"]), int(learned["held_out_gap"])
+    return config.held_out, config.gap
+
+
+def _registered(template: MapTemplate, sequence: RegisteredSequence, rows: range) -> _Method:
+    vertices = np.array(sequence.vertices[rows.start : rows.stop])
+    return _drawn_by("registration", template, vertices, template.low_normals, 0.0, has_map=False)
+
+
+def _drawn_by(
+    name: str,
+    template: MapTemplate,
+    vertices: np.ndarray,
+    normals: Callable[[np.ndarray], np.ndarray],
+    megabytes: float,
+    *,
+    extra_ms: float = 0.0,
+    has_map: bool = True,
+) -> _Method:
+    maps, times = [], []
+    for placed in vertices:
+        begin = time.perf_counter()
+        maps.append(normals(placed))
+        times.append(1e3 * (time.perf_counter() - begin))
+    return _Method(name, vertices, np.stack(maps), float(np.median(times)) + extra_ms, megabytes, has_map)
+
+
+def _moving(work: Path, capture: Capture) -> tuple[Body, PoseSequence] | None:
+    """The body and its poses, tracked or brought along."""
+    if (work / "body" / "poses.npz").is_file():
+        return load_tracking(work / "body")
+    body, poses = read_body(capture), read_poses(capture)
+    return None if body is None or poses is None else (body, poses)
+
+
+def _offset_methods(
+    template: MapTemplate,
+    sequence: RegisteredSequence,
+    body: Body,
+    poses: PoseSequence,
+    rows: range,
+    learned: int,
+    config: CompareConfig,
+) -> list[_Method]:
+    """Learn decoder and baseline on the first frames, and predict the held-out ones."""
+    garment, size = sequence.garment, config.image_texels
+    assert garment.skin_weights is not None
+    order = [poses.frame_ids.tolist().index(frame_id) for frame_id in sequence.frame_ids.tolist()]
+    ordered = replace(
+        poses,
+        rotations=poses.rotations[order],
+        translations=poses.translations[order],
+        frame_ids=poses.frame_ids[order],
+    )
+    joints = pose_joints(ordered, garment.skin_weights)
+    layout = OffsetLayout.create(garment, size)
+    frames = offset_frames(layout, body, ordered, np.array(sequence.vertices), joints)
+    training, cut = frames.rows(range(learned)), max(learned // 9, 1)
+    parts = training.rows(range(max(learned - cut, 1))), training.rows(range(learned - cut, learned))
+    held, sampler = frames.rows(list(rows)), OffsetSampler(layout)
+    torch.manual_seed(0)
+    channels = max(size * 3 // 2, 2 ** (size.bit_length() - 4))
+    networks = {
+        "offset images": ImageDecoder(frames.pose.shape[1], channels=channels, doublings=size.bit_length() - 4),
+        "fully connected, PCA": PcaFullyConnected(frames.pose.shape[1], parts[0].offsets, components=128),
+    }
+    methods = []
+    for name, network in networks.items():
+        train_offsets(network, layout, *parts, OffsetConfig(epochs=config.epochs, batch=min(16, len(parts[0]))))
+        made, ms = _predicted(network, sampler, held)
+        methods.append(
+            _drawn_by(name, template, made, template.low_normals, _megabytes(network), extra_ms=ms, has_map=False)
+        )
+    return methods
+
+
+def _predicted(network: torch.nn.Module, sampler: OffsetSampler, frames: OffsetFrames) -> tuple[np.ndarray, float]:
+    """Vertices, metres, and the median time of a frame alone, ms."""
+    made, times = [], []
+    for row in range(len(frames)):
+        begin = time.perf_counter()
+        made.append(predict(network, sampler, frames.rows([row]))[0].numpy() / 100)
+        times.append(1e3 * (time.perf_counter() - begin))
+    return np.stack(made), float(np.median(times))
+
+
+def _megabytes(network: torch.nn.Module) -> float:
+    return sum(each.numel() * each.element_size() for each in network.state_dict().values()) / MB
+
+
+def _true_vertices(capture: Capture, frame_ids: Sequence[int] | np.ndarray) -> np.ndarray | None:
+    model = read_truth_model(capture)
+    if model is None:
+        return None
+    return np.stack(
+        [
+            material_points(
+                read_truth_vertices(capture, int(frame_id)), model.fine.faces, model.template_faces,
+                model.template_barycentric,
+            )
+            for frame_id in frame_ids
+        ]
+    )  # fmt: skip
+
+
+def _measure(
+    method: _Method, template: MapTemplate, held: PairTake, truth: np.ndarray | None, registered: _Method
+) -> _Row:
+    """Against the scans' maps; vertices against the truth, or, where there is none, against the registration."""
+    raster = template.raster
+    images = [
+        raster.image((normals @ template.rotation(vertices)).astype(np.float32))
+        for normals, vertices in zip(method.normals, registered.vertices, strict=True)
+    ]
+    maps = torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2)
+    consecutive = torch.zeros(len(maps), dtype=torch.bool)
+    consecutive[torch.from_numpy(held.consecutive())] = True
+    scores = score(
+        maps, held.high.float(), held.valid, mm_per_texel=millimetres_per_texel(template.mesh, raster.size),
+        consecutive=consecutive,
+    )  # fmt: skip
+    reference = truth if truth is not None else None if method is registered else registered.vertices
+    errors = [] if reference is None else [
+        correspondence_errors(a, b).mean() for a, b in zip(method.vertices, reference, strict=True)
+    ]  # fmt: skip
+    return _Row(
+        method.name, _number(1e3 * float(np.mean(errors))) if errors else None, _number(scores.normal_error_deg),
+        _number(scores.wrinkle_energy_kept), _number(scores.flicker_deg), method.ms_per_frame, method.megabytes,
+    )  # fmt: skip
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _pictures(
+    capture: Capture, template: MapTemplate, methods: Sequence[_Method], held: PairTake, at: int
+) -> list[Panel]:
+    """The scan, every surface, and those with a map once more with it; the scan's own map last."""
+    frame_id = int(held.frame_ids[at])
+    registered = methods[0].vertices
+    span = np.ptp(registered.reshape(len(registered), -1, 3), axis=1).max(axis=0)
+    framing = Framing((float(span[0]), float(span[1]), float(span[2])))
+    view = framing.view(registered[at], "three_quarter")
+    scan = read_scan(capture, frame_id)
+
+    def drawn(vertices: np.ndarray, normal_map: np.ndarray | None = None) -> str:
+        mesh = template.mesh.with_vertices(vertices)
+        return data_uri(render([Drawn(mesh, normal_map=normal_map)], view, width=WIDTH, height=HEIGHT))
+
+    frames = template.frames(registered[at])
+    panels = [Panel("scan", data_uri(render([Drawn(scan.mesh, scan.colours)], view, width=WIDTH, height=HEIGHT)))]
+    for method in methods:
+        tangent = _tangent_image(template, method.normals[at], template.frames(method.vertices[at]))
+        panels.append(Panel(method.name, drawn(method.vertices[at], tangent if method.has_map else None)))
+    valid = template.raster.read(held.valid[at, 0].numpy())
+    world = template.raster.read(held.high[at].float().permute(1, 2, 0).numpy()) @ template.rotation(registered[at]).T
+    high = fill_holes(_tangent_image(template, world, frames), template.raster.image(valid))
+    high[..., 2] = np.where(np.abs(high).sum(axis=-1) > 0, high[..., 2], 1)
+    return [*panels, Panel("map of the scan", drawn(registered[at], high))]
+
+
+def _tangent_image(template: MapTemplate, normals: np.ndarray, frames: np.ndarray) -> np.ndarray:
+    image = template.raster.image(to_tangent(normals, frames).astype(np.float32))
+    image[~template.raster.image(np.ones(len(normals), bool))] = (0, 0, 1)
+    return image
+
+
+def _strip(template: MapTemplate, methods: Sequence[_Method], held: PairTake, at: int) -> list[Panel]:
+    """The angle of every method's normals to the scan's, in the map."""
+    rotation, valid = template.rotation(methods[0].vertices[at]), held.valid[at].numpy()[0]
+    panels = []
+    for method in methods:
+        image = template.raster.image((method.normals[at] @ rotation).astype(np.float32))
+        angle = angles(torch.from_numpy(image).permute(2, 0, 1)[None], held.high[at].float()[None])[0, 0].numpy()
+        colours = heat_colours(np.where(valid, angle, np.nan).ravel(), high=ERROR_DEG).reshape(*angle.shape, 3)
+        panels.append(Panel(method.name, data_uri(colours)))
+    return panels

@@ -1,0 +1,71 @@
+"""The comparison on a sleeve with a body inside: one row a surface, one page, nothing learned from held-out frames."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from capture4d.app.cli import main
+from capture4d.garment_binding import bind
+from capture4d.records import save_body, save_poses
+from capture4d.scans import write_scan
+from capture4d.types import PoseSequence, Scan
+from tests.unit.wrinkles.conftest import make_work, some_garment, some_scan
+from tests.unit.wrinkles.test_offsets import limb, upright
+from tests.unit.wrinkles.test_stages import SMALL
+
+FRAMES = 8
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A work folder with its comparison."""
+    folder = tmp_path_factory.mktemp("compared")
+    garment, body = some_garment(), limb()
+    at, weights, skin_weights = bind(garment.template.vertices, garment.template.faces, upright(body))
+    bound = replace(
+        garment, embedding_faces=at, embedding_barycentric=weights, skin_weights=skin_weights.astype(np.float32)
+    )
+    scans = [some_scan(phase=0.3 * frame) for frame in range(FRAMES)]
+    work = make_work(folder, bound, scans)
+    ids = np.arange(1, FRAMES + 1, dtype=np.int32)
+    still = np.tile(np.eye(3, dtype=np.float32), (FRAMES, 2, 1, 1))
+    poses = PoseSequence(still, np.zeros((FRAMES, 3), np.float32), np.zeros(1, np.float32), ids, 60.0, body.joint_names)
+    save_body(folder / "capture" / "body.npz", body)
+    save_poses(folder / "capture" / "poses.npz", poses)
+    for frame_id, scan in zip(ids.tolist(), scans, strict=True):
+        colours = np.full((len(scan.vertices), 3), 120, np.uint8)
+        write_scan(folder / "capture" / "scans" / f"{frame_id:06d}.ply", Scan(scan, colours, frame_id, 0.0))
+    for arguments in (
+        ["wrinkles", "train", work, "--output", folder / "model", *SMALL],
+        ["compare", work, "--model", folder / "model", "--image-texels", "32", "--epochs", "2", "--workers", "1"],
+    ):
+        with pytest.raises(SystemExit) as exit_:
+            main([str(argument) for argument in arguments])
+        assert not exit_.value.code
+    return work / "compare"
+
+
+def test_every_surface_has_a_row(compared: Path):
+    result = json.loads((compared / "compare.json").read_text())
+    rows = {row["name"]: row for row in result["methods"]}
+    assert list(rows) == ["registration", "network", "offset images", "fully connected, PCA"]
+    # a fifth of eight frames was held out of the training, and those are compared
+    assert result["frames"] == [7, 8]
+    assert 4 < rows["registration"]["normal_deg"] < 12
+    assert rows["registration"]["vertex_mm"] is None
+    assert rows["network"]["vertex_mm"] == 0
+    assert rows["network"]["model_mb"] > 0
+    # the sleeve does not move, so the mean of the offsets, which PCA starts from, is the sleeve
+    assert rows["fully connected, PCA"]["vertex_mm"] < 5
+    assert all(row["ms_per_frame"] > 0 for row in rows.values())
+
+
+def test_the_page_stands_alone_and_shows_all(compared: Path):
+    page = (compared / "index.html").read_text()
+    assert "http" not in page.replace("https://www.w3.org", "")
+    assert page.count("<figure>") == 2 * (6 + 4)
+    for name in ("scan", "network", "offset images", "map of the scan"):
+        assert f"<figcaption>{name}</figcaption>" in page

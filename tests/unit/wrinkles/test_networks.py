@@ -1,0 +1,75 @@
+"""Sizes as printed: parameters, receptive field, outputs."""
+
+import pytest
+import torch
+
+from wrinkles.config import PRESETS, NetworkConfig
+from wrinkles.networks import PatchDiscriminator, UNet, receptive_field, set_test_statistics
+
+PAPER = NetworkConfig()
+SMALL = NetworkConfig(filters=4, layers=5, output="residual", dropout=0.0)
+
+
+def parameters(network: torch.nn.Module) -> int:
+    return sum(each.numel() for each in network.parameters())
+
+
+def test_the_paper_s_networks_have_the_known_numbers_of_parameters():
+    with torch.device("meta"):
+        generator, discriminator = UNet(PAPER), PatchDiscriminator(PAPER)
+    assert parameters(generator) == 54_413_955
+    assert parameters(discriminator) == 2_768_705
+    assert PRESETS["paper"].network == PAPER
+
+
+@pytest.mark.parametrize(("size", "patches"), [(256, 30), (512, 62)])
+def test_the_discriminator_sees_patches_of_70_texels(size: int, patches: int):
+    with torch.device("meta"):
+        discriminator = PatchDiscriminator(PAPER)
+        image = torch.zeros(1, 3, size, size)
+        assert discriminator(image, image).shape == (1, 1, patches, patches)
+    assert receptive_field(discriminator) == 70
+
+
+def test_a_logit_depends_on_its_patch_and_on_nothing_else():
+    discriminator = PatchDiscriminator(NetworkConfig(filters=4)).eval()
+    image = torch.randn(1, 3, 128, 128, requires_grad=True)
+    discriminator(image, image)[0, 0, 7, 7].backward()
+    assert image.grad is not None
+    touched = image.grad.abs().sum(dim=(0, 1)).nonzero()
+    assert (touched.amax(dim=0) - touched.amin(dim=0) + 1).tolist() == [70, 70]
+
+
+def test_the_generator_keeps_the_size_of_its_map():
+    with torch.device("meta"):
+        assert UNet(PAPER)(torch.zeros(2, 3, 256, 256)).shape == (2, 3, 256, 256)
+
+
+def test_three_inner_layers_of_the_paper_s_decoder_drop_out():
+    with torch.device("meta"):
+        decoder = UNet(PAPER).up
+    drops = [any(isinstance(each, torch.nn.Dropout) for each in layer) for layer in decoder]
+    assert drops == [False, True, True, True, False, False, False, False]
+
+
+def test_a_residual_generator_starts_near_its_input():
+    torch.manual_seed(0)
+    low = torch.nn.functional.normalize(torch.randn(1, 3, 64, 64), dim=1)
+    made = UNet(SMALL)(low)
+    assert (made - low).abs().mean() < 0.3
+    assert not torch.equal(made, low)
+
+
+def test_instance_statistics_leave_no_trace_and_running_ones_do_not_look_at_the_map():
+    torch.manual_seed(0)
+    network = UNet(SMALL)
+    network(torch.randn(4, 3, 32, 32))
+    before = {name: value.clone() for name, value in network.state_dict().items() if "num_batches" not in name}
+    one, other = torch.randn(1, 3, 32, 32), torch.randn(1, 3, 32, 32)
+    set_test_statistics(network, "running")
+    together = network(torch.cat([one, other]))
+    torch.testing.assert_close(together[:1], network(one))
+    set_test_statistics(network, "instance")
+    assert not torch.allclose(network(one), together[:1])
+    for name, value in before.items():
+        torch.testing.assert_close(network.state_dict()[name], value)

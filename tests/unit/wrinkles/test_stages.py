@@ -1,0 +1,263 @@
+"""The wrinkle commands on folders: what they write, how they resume, and what they say about bad input."""
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from capture4d.app.cli import main
+from capture4d.records import load_garment, save_garment
+from capture4d.types import Garment, Mesh
+from capture4d.workdir import write_bytes
+from tests.unit.wrinkles.conftest import make_work, some_garment, some_scan, wrinkle_normals
+from wrinkles import train_stage
+from wrinkles.config import MapConfig
+from wrinkles.display import fill_holes
+from wrinkles.map_spaces import decode_png, encode_png, from_tangent
+from wrinkles.normal_maps import MapTemplate
+
+SMALL = ["--pairs.map.size", "64", "--texels", "32", "--network.filters", "4", "--network.layers", "5",
+         "--schedule.steps", "6", "--schedule.checkpoint-every", "2", "--schedule.sample-every", "3",
+         "--schedule.log-every", "2", "--schedule.batch", "2", "--held-out", "0.2", "--workers", "1"]  # fmt: skip
+
+
+def run(*arguments: str | Path) -> int:
+    with pytest.raises(SystemExit) as exit_:
+        main([str(argument) for argument in arguments])
+    return int(exit_.value.code or 0)
+
+
+def fails(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
+    capsys.readouterr()
+    assert run(*arguments) == 1
+    said = capsys.readouterr().err.strip()
+    assert "Traceback" not in said
+    line = said.splitlines()[-1]
+    assert line.startswith("capture4d: ")
+    return line
+
+
+def train(work: Path, model: Path, *more: str) -> tuple[str | Path, ...]:
+    return "wrinkles", "train", work, "--output", model, *SMALL, *more
+
+
+@pytest.fixture(scope="module")
+def trained_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A work folder and a model trained on it, to be copied."""
+    folder = tmp_path_factory.mktemp("trained")
+    work = make_work(folder, some_garment(), [some_scan(phase=0.3 * frame) for frame in range(6)])
+    assert run(*train(work, folder / "model")) == 0
+    return folder
+
+
+@pytest.fixture
+def trained(trained_once: Path, tmp_path: Path) -> Path:
+    """A trained model, and the work folder it learned from at `work` beside it."""
+    shutil.copytree(trained_once, tmp_path, dirs_exist_ok=True)
+    return tmp_path / "model"
+
+
+@pytest.fixture
+def work(trained_once: Path, tmp_path: Path) -> Path:
+    """The work folder without its maps."""
+    shutil.copytree(trained_once / "capture", tmp_path / "capture", dirs_exist_ok=True)
+    shutil.copytree(trained_once / "work", tmp_path / "work", dirs_exist_ok=True)
+    shutil.rmtree(tmp_path / "work" / "wrinkles")
+    return tmp_path / "work"
+
+
+# --- maps
+
+
+def test_maps_are_written_as_they_were_computed(work: Path, garment: Garment):
+    assert run("wrinkles", "maps", work, "--map.size", "128", "--workers", "1") == 0
+    pairs = work / "wrinkles" / "pairs"
+    assert [path.name for path in sorted((pairs / "high").iterdir())] == [f"{frame:06d}.png" for frame in range(1, 7)]
+    template = MapTemplate.create(garment, MapConfig(size=128))
+    np.testing.assert_array_equal(load_garment(pairs / "template.npz").template.uv, template.mesh.uv)
+    high, valid = decode_png((pairs / "high" / "000001.png").read_bytes(), source="high")
+    low, shown = decode_png((pairs / "low" / "000001.png").read_bytes(), source="low")
+    # the template has not moved, so garment coordinates are the world's
+    points = template.raster.at_vertices(garment.template.vertices.astype(float))
+    truth = wrinkle_normals(points)
+    known = template.raster.read(valid) & template.raster.inside
+    error = np.degrees(np.arccos(np.clip((template.raster.read(high) * truth).sum(1), -1, 1)))[known]
+    assert error.mean() < 3.5  # the phase moves on by a twentieth of a wave between the frames averaged
+    assert known.sum() > 0.9 * template.raster.inside.sum()
+    np.testing.assert_allclose(template.raster.read(low), template.low_normals(garment.template.vertices), atol=1e-4)
+    assert template.raster.read(shown).all()
+    measured = json.loads((pairs / "metrics" / "000001.json").read_text())
+    assert 8 < measured["difference_deg"] < 11
+
+
+def test_maps_lost_are_made_again_alike(work: Path):
+    arguments = ("wrinkles", "maps", work, "--map.size", "64", "--workers", "1")
+    assert run(*arguments) == 0
+    path = work / "wrinkles" / "pairs" / "high" / "000003.png"
+    before = path.read_bytes()
+    path.unlink()
+    assert run(*arguments) == 0
+    assert path.read_bytes() == before
+
+
+# --- training and use
+
+
+def test_a_model_is_trained_measured_and_applied(work: Path, trained: Path, garment: Garment):
+    rows = [json.loads(line) for line in (trained / "metrics.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in rows] == [2, 4, 6]
+    assert set(rows[0]) == {"step", "data", "temporal", "gan", "discriminator"}
+    assert sorted(path.name for path in (trained / "samples").iterdir()) == ["000003.png", "000006.png"]
+    assert len(list((trained / "checkpoints").iterdir())) == 2
+    measured = json.loads((trained / "held_out.json").read_text())["work"]
+    assert measured["low"]["normal_error_deg"] > 3  # 20 mm texels blur waves of 50 mm
+
+    assert run("wrinkles", "apply", trained, work, "--workers", "1") == 0
+    made = work / "wrinkles" / "generated"
+    image, _ = decode_png((made / "frames" / "000002.png").read_bytes(), source="made")
+    template = MapTemplate.create(garment, MapConfig(size=64))
+    tangent = template.raster.read(image)
+    np.testing.assert_allclose(np.linalg.norm(tangent, axis=1), 1, atol=1e-3)
+    assert tangent[:, 2].mean() > 0.7
+    world = from_tangent(tangent, template.frames(garment.template.vertices))
+    assert (world * template.low_normals(garment.template.vertices)).sum(1).mean() > 0.7
+    assert np.load(made / "tangents.npy").shape == (len(garment.template.faces), 3, 4)
+
+
+def test_green_is_flipped_on_demand_and_delivery_is_8_bit(work: Path, trained: Path):
+    import cv2
+
+    frame = work / "wrinkles" / "generated" / "frames" / "000001.png"
+    assert run("wrinkles", "apply", trained, work, "--workers", "1") == 0
+    up, _ = decode_png(frame.read_bytes(), source="up")
+    assert run("wrinkles", "apply", trained, work, "--workers", "1", "--flip-green", "--overwrite") == 0
+    down, _ = decode_png(frame.read_bytes(), source="down")
+    np.testing.assert_allclose(down, up * np.array([1, -1, 1]), atol=1e-4)
+    assert run("wrinkles", "apply", trained, work, "--workers", "1", "--bits", "8", "--overwrite") == 0
+    pixels = cv2.imread(str(frame), cv2.IMREAD_UNCHANGED)
+    assert pixels.dtype == np.uint8
+    assert np.abs(pixels[..., ::-1] / 127.5 - 1 - up).max() < 0.01
+
+
+def test_an_interrupted_training_ends_with_the_same_weights(
+    work: Path, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    step, done = train_stage.train_step, []
+
+    def stopping(*arguments: object) -> dict[str, float]:
+        done.append(1)
+        if len(done) == 4:
+            raise KeyboardInterrupt
+        return step(*arguments)  # pyright: ignore
+
+    monkeypatch.setattr(train_stage, "train_step", stopping)
+    assert run(*train(work, tmp_path / "again")) == 130
+    monkeypatch.setattr(train_stage, "train_step", step)
+    assert run(*train(work, tmp_path / "again")) == 0
+    for name in ("generator.safetensors", "checkpoints/000006.safetensors", "metrics.jsonl", "samples/000006.png"):
+        assert (tmp_path / "again" / name).read_bytes() == (trained / name).read_bytes(), name
+
+
+@pytest.mark.slow
+def test_a_killed_training_ends_with_the_same_weights(work: Path, tmp_path: Path):
+    more = ("--schedule.steps", "60")
+    assert run(*train(work, tmp_path / "whole", *more)) == 0
+    command = [sys.executable, "-m", "capture4d", *map(str, train(work, tmp_path / "killed", *more))]
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    while not list((tmp_path / "killed").glob("checkpoints/*.safetensors")):
+        assert process.poll() is None
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    subprocess.run(command, check=True, capture_output=True)
+    name = "generator.safetensors"
+    assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+
+
+# --- bad input: one line, exit 1
+
+
+def test_a_checkpoint_of_another_architecture(
+    work: Path, trained: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+):
+    other = tmp_path / "other"
+    assert run(*train(work, other, "--network.filters", "2")) == 0
+    last = "checkpoints/000006.safetensors"
+    (trained / last).write_bytes((other / last).read_bytes())
+    assert "another architecture" in fails(capsys, *train(work, trained))
+    damaged = (trained / "generator.safetensors").read_bytes()[:-100]
+    (trained / "generator.safetensors").write_bytes(damaged)
+    assert "generator.safetensors: not a readable safetensors" in fails(capsys, "wrinkles", "apply", trained, work)
+    assert "other weights" in fails(capsys, "wrinkles", "apply", other / last, work)
+    assert "no such file" in fails(capsys, "wrinkles", "apply", tmp_path / "nowhere", work)
+
+
+def test_a_mask_of_another_size(work: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert run("wrinkles", "maps", work, "--map.size", "64", "--workers", "1") == 0
+    path = work / "wrinkles" / "pairs" / "high" / "000002.png"
+    image = np.zeros((32, 32, 3), np.float32)
+    write_bytes(path, encode_png(image, np.ones((32, 32), bool)))
+    line = fails(capsys, *train(work, tmp_path / "model"))
+    assert "000002.png: expected a map and a mask of 64 x 64 texels, found 32 x 32" in line
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda uv: None, "expected UVs, found none"),
+        (lambda uv: 3 * uv, "expected UVs in the unit square"),
+        (lambda uv: np.where(uv[..., :1] > 0.35, uv - np.float32([0.4, 0]), uv) * np.float32(0.5), "used twice"),
+    ],
+    ids=["no UVs", "outside the unit square", "overlapping islands"],
+)
+def test_uvs_that_make_no_map(
+    tmp_path: Path, garment: Garment, scan_of: Callable[..., Mesh], capsys: pytest.CaptureFixture[str],
+    change: Callable[[np.ndarray], np.ndarray | None], said: str,
+):  # fmt: skip
+    mesh = garment.template
+    assert mesh.uv is not None
+    changed = Mesh(mesh.vertices, mesh.faces, change(mesh.uv))
+    bad = make_work(tmp_path, replace(garment, template=changed), [scan_of()])
+    assert said in fails(capsys, "wrinkles", "maps", bad, "--workers", "1")
+    assert said in fails(capsys, *train(bad, tmp_path / "model"))
+
+
+def test_a_model_for_another_template(work: Path, trained: Path, garment: Garment, capsys: pytest.CaptureFixture[str]):
+    mesh = garment.template
+    assert mesh.uv is not None
+    moved = Mesh(mesh.vertices, mesh.faces, mesh.uv * np.float32(0.9))
+    save_garment(work / "registration" / "garment.npz", replace(garment, template=moved))
+    assert "expected the template that" in fails(capsys, "wrinkles", "apply", trained, work)
+
+
+def test_what_is_missing_is_named(tmp_path: Path, work: Path, capsys: pytest.CaptureFixture[str]):
+    assert "expected a work folder with a registration" in fails(capsys, "wrinkles", "maps", tmp_path / "nothing")
+    (work / "garment" / "stage.json").unlink()
+    assert "extract" in fails(capsys, "wrinkles", "maps", work)
+
+
+def test_the_group_has_an_overview(capsys: pytest.CaptureFixture[str]):
+    assert run("wrinkles", "--help") == 0
+    said = capsys.readouterr().out
+    assert "wrinkles train" in said
+    assert "register-mesh" not in said
+    assert run("wrinkles") == 2
+    assert run("wrinkles", "trian") == 2
+    assert "did you mean 'wrinkles train'" in capsys.readouterr().err
+
+
+def test_filling_is_for_display_only(work: Path):
+    """A hole in a scan stays a hole in the pairs; only what is shown has none."""
+    assert run("wrinkles", "maps", work, "--map.size", "64", "--workers", "1") == 0
+    high, valid = decode_png((work / "wrinkles" / "pairs" / "high" / "000001.png").read_bytes(), source="high")
+    assert not valid.all()
+    assert np.abs(high[~valid]).max() < 1e-4
+    assert np.linalg.norm(fill_holes(high, valid)[~valid], axis=-1).min() > 0

@@ -1,0 +1,140 @@
+"""A network learns one pair by heart; a run that was interrupted goes on as if it had not been."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch.nn.functional import normalize
+
+from capture4d.errors import InputError
+from wrinkles.config import AugmentationConfig, LossConfig, NetworkConfig, ScheduleConfig, WrinkleConfig
+from wrinkles.pairs import PairTake, augmented, batches, fitted, halved, split
+from wrinkles.training import learning_rate, load_tensors, new_state, state_tensors, train_step
+
+CONFIG = WrinkleConfig(
+    texels=32,
+    network=NetworkConfig(filters=8, layers=5, output="residual", dropout=0.5),
+    schedule=ScheduleConfig(steps=100, batch=2, learning_rate=2e-3),
+    augmentation=AugmentationConfig(turn_deg=5, noise=0.01),
+)
+
+
+def take(frames: int = 6, size: int = 32, frame_ids: list[int] | None = None) -> PairTake:
+    """Maps whose high normals lean by a wave that the low ones tell by their own lean."""
+    rng = np.random.default_rng(0)
+    row = np.arange(size) / size
+    wave = np.sin(2 * np.pi * (4 * row[None, :, None] + np.arange(frames)[:, None, None] / 12))
+    lean = 0.2 * rng.standard_normal((frames, 1, 1))
+    low = np.stack(np.broadcast_arrays(lean, 0 * wave, np.ones((frames, size, size))), axis=1)
+    high = low + np.stack(np.broadcast_arrays(np.zeros((1, 1, 1)), 0.4 * wave, np.zeros((frames, size, size))), axis=1)
+    valid = torch.ones(frames, 1, size, size, dtype=torch.bool)
+    valid[:, :, :4, :4] = False
+    unit = [normalize(torch.from_numpy(image).float(), dim=1) for image in (low, high)]
+    ids = np.array(frame_ids or range(1, frames + 1), np.int32)
+    return PairTake("take", ids, unit[0].half(), (unit[1] * valid).half(), valid)
+
+
+def test_an_overfitted_pair_is_learned_by_heart():
+    config = replace(
+        CONFIG, augmentation=AugmentationConfig(), network=replace(CONFIG.network, dropout=0.0),
+        loss=LossConfig(gan=0.1, temporal=0.0), schedule=replace(CONFIG.schedule, batch=1),
+    )  # fmt: skip
+    state, one = new_state(config), take(2)
+    losses = []
+    for batch, _ in zip(batches([one], size=1, seed=0, start=0), range(100), strict=False):
+        losses.append(train_step(state, batch, config)["data"])
+    assert losses[-1] < 0.15 * losses[0]
+
+
+def test_a_resumed_run_is_the_same_run_bit_for_bit():
+    def go_on(state, steps: int):
+        stream = batches([take()], size=2, seed=CONFIG.seed, start=state.step)
+        for batch, _ in zip(stream, range(steps), strict=False):
+            train_step(state, batch, CONFIG)
+        return state
+
+    whole = state_tensors(go_on(new_state(CONFIG), 8))
+    saved = state_tensors(go_on(new_state(CONFIG), 5))
+    torch.manual_seed(99)
+    resumed = new_state(replace(CONFIG, seed=7))
+    load_tensors(resumed, saved, source="checkpoint")
+    assert resumed.step == 5
+    again = state_tensors(go_on(resumed, 3))
+    assert whole.keys() == again.keys()
+    for name, tensor in whole.items():
+        assert torch.equal(tensor, again[name]), name
+
+
+def test_weights_of_another_architecture_are_refused():
+    saved = state_tensors(new_state(CONFIG))
+    other = new_state(replace(CONFIG, network=replace(CONFIG.network, filters=4)))
+    with pytest.raises(InputError, match=r"x: weights of another architecture: '.*', expected .*, found"):
+        load_tensors(other, saved, source="x")
+    deeper = new_state(replace(CONFIG, texels=64, network=replace(CONFIG.network, layers=6)))
+    with pytest.raises(InputError, match="another architecture"):
+        load_tensors(deeper, saved, source="x")
+    with pytest.raises(InputError, match="at most 5 for maps of 32"):
+        new_state(replace(CONFIG, network=replace(CONFIG.network, layers=6)))
+
+
+def test_batches_are_the_same_from_wherever_one_starts_and_epochs_are_complete():
+    one = take(7)
+    stream = batches([one], size=2, seed=3, start=0)
+    first = [next(stream) for _ in range(6)]
+    later = next(batches([one], size=2, seed=3, start=4))
+    torch.testing.assert_close(first[4].low, later.low)
+    lows = torch.cat([batch.low for batch in first[:3]]).flatten(1)
+    assert len(torch.unique(lows, dim=0)) == 6  # 6 consecutive pairs of 7 frames, each once
+
+
+def test_the_frame_before_is_the_frame_before():
+    one = take(6, frame_ids=[1, 2, 3, 8, 9, 10])
+    assert one.consecutive().tolist() == [1, 2, 4, 5]
+    batch = next(batches([one], size=4, seed=0, start=0))
+    for low, previous in zip(batch.high, batch.previous, strict=True):
+        at = [torch.equal(low, each.float()) for each in one.high].index(True)
+        assert torch.equal(previous, one.high[at - 1].float())
+
+
+def test_a_take_without_neighbours_is_refused():
+    one = take(4)
+    blank = replace(one, valid=torch.zeros_like(one.valid))
+    with pytest.raises(InputError, match="take: expected consecutive frames"):
+        next(batches([blank], size=1, seed=0, start=0))
+
+
+def test_the_end_of_a_take_is_held_out_behind_a_gap():
+    train, held = split(take(40), held_out=0.1, gap=10)
+    assert held.frame_ids.tolist() == [37, 38, 39, 40]
+    assert train.frame_ids.tolist() == list(range(1, 33))
+    with pytest.raises(InputError, match="at least 2 frames"):
+        split(take(2), held_out=0.5, gap=0)
+
+
+def test_turned_pairs_keep_their_angles():
+    torch.manual_seed(0)
+    batch = next(batches([take()], size=3, seed=0, start=0))
+    turned = augmented(batch, AugmentationConfig(turn_deg=30))
+    assert not torch.allclose(turned.low, batch.low)
+    torch.testing.assert_close((turned.low * turned.high).sum(1), (batch.low * batch.high).sum(1))
+    torch.testing.assert_close(turned.low[:, 1], batch.low[:, 1])
+    assert augmented(batch, AugmentationConfig()) is batch
+
+
+def test_halved_maps_are_means_of_what_is_known():
+    one = take(2)
+    half = halved(one)
+    assert half.low.shape == (2, 3, 16, 16)
+    assert not half.valid[:, :, :2, :2].any()
+    assert half.valid[:, :, 2:].all()
+    expected = normalize(one.high[0, :, 8:10, 8:10].float().mean(dim=(1, 2)), dim=0)
+    torch.testing.assert_close(half.high[0, :, 4, 4].float(), expected, atol=2e-3, rtol=0)
+    assert fitted(one, 8).low.shape[-1] == 8
+    with pytest.raises(InputError, match="24 texels"):
+        fitted(one, 24)
+
+
+def test_the_learning_rate_falls_to_zero():
+    schedule = ScheduleConfig(steps=100, learning_rate=1.0, decay_from=0.5)
+    assert [learning_rate(step, schedule) for step in (0, 50, 75, 100)] == [1.0, 1.0, 0.5, 0.0]

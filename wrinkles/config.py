@@ -1,0 +1,152 @@
+"""Settings of the wrinkles, split by role. Standard library only: the command line imports this to print its help."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+__all__ = [
+    "PRESETS",
+    "AugmentationConfig",
+    "LossConfig",
+    "MapConfig",
+    "NetworkConfig",
+    "PairConfig",
+    "ProjectionConfig",
+    "ScheduleConfig",
+    "WrinkleConfig",
+]
+
+TemporalLoss = Literal["printed", "l1", "l2", "none"]
+
+
+@dataclass(frozen=True, slots=True)
+class MapConfig:
+    """The image in which normals lie."""
+
+    size: int = 256
+    """Texels along each side."""
+    padding: int = 4
+    """Texels around the UV islands that repeat the nearest surface point."""
+    layout: Literal["auto", "keep", "pack"] = "auto"
+    """UVs in the unit square are kept, patterns in metres packed into it (auto); or one of the two always."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProjectionConfig:
+    """How a scan is read from the template. On simulated scans, gates of 10-15 mm and 60 deg left a fifth of the
+    wrinkle energy that gates of 4-6 mm and 45 deg leave."""
+
+    distance_m: float = 0.006
+    """A scan farther than this from the template says nothing."""
+    angle_deg: float = 45.0
+    """Nor does one that faces another way by more than this."""
+    border_rings: int = 1
+    """Rings of scan vertices along open borders, beyond the border itself, that are not trusted; 0 trusts all."""
+    smoothing_passes: int = 1
+    """Steps of half-way averaging of the scan's normals with their neighbours'."""
+    temporal_frames: int = 3
+    """Frames averaged in tangent space, an odd number."""
+    temporal_span_s: float = 0.02
+    """Neighbours farther apart in time are left out: the cloth itself has moved."""
+    blur_texels: float = 0.5
+    """Standard deviation of the blur, texels of a map of 256."""
+
+
+@dataclass(frozen=True, slots=True)
+class PairConfig:
+    """Pairs of low- and high-resolution normal maps."""
+
+    map: MapConfig = field(default_factory=MapConfig)
+    projection: ProjectionConfig = field(default_factory=ProjectionConfig)
+
+
+@dataclass(frozen=True, slots=True)
+class NetworkConfig:
+    """Generator and discriminator (DeepWrinkles 4.1; Isola et al. 2017, appendix)."""
+
+    filters: int = 64
+    """In the first convolution of both."""
+    layers: int = 8
+    """Down and up convolutions each; the map is 2^layers texels wide, or a multiple."""
+    output: Literal["absolute", "residual"] = "absolute"
+    """What the generator's tanh is: the normals, or what to add to those of the input."""
+    dropout: float = 0.5
+    """In three inner layers of the decoder."""
+    norm_at_test: Literal["instance", "running"] = "running"
+    """Statistics of batch norm when maps are made: those of the map itself, as in pix2pix, or training's means."""
+
+
+@dataclass(frozen=True, slots=True)
+class LossConfig:
+    """L = gan * L_GAN + data * L_data + temporal * L_temp (DeepWrinkles, Eq. 3-4)."""
+
+    gan: float = 1.0
+    data: float = 100.0
+    temporal: float = 50.0
+    temporal_kind: TemporalLoss = "printed"
+    """`printed` is Eq. 4, the net change of each channel; l1 and l2 compare texel by texel."""
+
+
+@dataclass(frozen=True, slots=True)
+class AugmentationConfig:
+    """Changes of the training pairs. Flips and crops would break the UVs and are not among them."""
+
+    turn_deg: float = 0.0
+    """Standard deviation of a common rotation of low and high normals about the vertical."""
+    noise: float = 0.0
+    """Standard deviation of noise on the input normals."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScheduleConfig:
+    """How long to train, and what to keep."""
+
+    steps: int = 20_000
+    batch: int = 1
+    learning_rate: float = 2e-4
+    beta1: float = 0.5
+    decay_from: float = 0.5
+    """Share of the steps after which the learning rate falls linearly to zero."""
+    checkpoint_every: int = 500
+    sample_every: int = 500
+    """Steps between sheets of sample maps."""
+    log_every: int = 20
+    half_precision: bool = False
+    """Compute in bfloat16 where torch thinks it safe; on a CPU it pays from 32 filters up."""
+
+
+@dataclass(frozen=True, slots=True)
+class WrinkleConfig:
+    """Learning high-resolution normal maps from low ones."""
+
+    seed: int = 0
+    held_out: float = 0.1
+    """Share at the end of every take that is left out of training, to be drawn and measured."""
+    held_out_gap: int = 10
+    """Frames between the two that belong to neither; neighbours are too alike."""
+    texels: int = 256
+    """Side of the maps to learn; pairs are halved until they fit."""
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
+    augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)
+    schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
+
+
+_SMALL = WrinkleConfig(
+    texels=128,
+    network=NetworkConfig(filters=32, layers=7, output="residual", dropout=0.0),
+    schedule=ScheduleConfig(steps=8000, batch=4, learning_rate=4e-4, half_precision=True),
+)
+PRESETS: Mapping[str, WrinkleConfig] = {
+    "small": _SMALL,
+    "small-256": replace(
+        _SMALL,
+        texels=256,
+        network=replace(_SMALL.network, filters=16, layers=8),
+        schedule=replace(_SMALL.schedule, steps=12_000, batch=2, half_precision=False),
+    ),
+    "paper": WrinkleConfig(),
+}
+"""`paper` is DeepWrinkles as printed, with pix2pix's defaults where it is silent; the others learn on a CPU."""

@@ -1,0 +1,139 @@
+"""The stage that makes pairs of normal maps: a registered WORK in, WORK/wrinkles/pairs out.
+
+stage.json            what was made
+template.npz          the garment, its UVs as the maps have them
+low/000123.png        normals of the registered template, garment coordinates, 16 bit; alpha: the texel shows something
+high/000123.png       normals of the scan; alpha: they are known
+metrics/000123.json   share of the texels that are known, and the angle between the two
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from pathlib import Path
+
+import numpy as np
+
+from capture4d.garment_stage import load_garment_scan
+from capture4d.records import save_garment
+from capture4d.types import Mesh, RegisteredSequence
+from capture4d.work_folder import failed_frames, load_registration, registered_digest, work_capture
+from capture4d.workdir import Stage, open_stage, read_json, require_complete, run_jobs, write_bytes, write_json
+from wrinkles.config import PairConfig
+from wrinkles.map_spaces import encode_png
+from wrinkles.normal_maps import FramePair, MapTemplate, frame_pairs
+
+__all__ = ["ensure_pairs", "run"]
+
+SCHEMA = 1
+RUN_FRAMES = 24
+"""Frames a worker makes in a row; at both ends of a run a scan is read twice."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Run:
+    work: Path
+    stage: Stage
+    fps: float
+    positions: range
+
+
+def run(work: Path, config: PairConfig, *, workers: int = 1, overwrite: bool = False) -> str:
+    """Make the pair of every frame that has none yet; the digest of the result.
+
+    Raises:
+        InputError: the work folder lacks its registration or its scans' garments, or the template has no usable UVs.
+    """
+    upstream = {
+        "registration": registered_digest(work),
+        "garment": require_complete(work / "garment", "extract", f"capture4d extract CAPTURE --output {work}"),
+    }
+    fps = work_capture(work).fps
+    template = _template(work, config)
+    sequence = load_registration(work / "registration")
+    output = work / "wrinkles" / "pairs"
+    stage = open_stage(output, name="pairs", schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite)
+    if not (output / "template.npz").is_file():
+        save_garment(output / "template.npz", replace(sequence.garment, template=template.mesh))
+    frame_ids = sequence.frame_ids.tolist()
+    pending = set(stage.pending(frame_ids, ".png", folder="high"))
+    runs = [range(start, min(start + RUN_FRAMES, len(frame_ids))) for start in range(0, len(frame_ids), RUN_FRAMES)]
+    jobs = [
+        _Run(work, stage, fps, positions) for positions in runs if pending.intersection(frame_ids[p] for p in positions)
+    ]
+
+    def finished() -> int:
+        return len(frame_ids) - len(stage.pending(frame_ids, ".png", folder="high"))
+
+    make = partial(_make, config)
+    for _ in run_jobs(make, jobs, workers=workers, label="normal maps", units=_length, finished=finished):
+        pass
+    _template.cache_clear()
+    maps = [stage.frame_path(frame_id, ".png", folder=folder) for folder in ("low", "high") for frame_id in frame_ids]
+    return stage.finish([output / "template.npz", *maps])
+
+
+def ensure_pairs(work: Path, config: PairConfig, *, workers: int = 1) -> None:
+    """Make a work folder's pairs, unless it has finished ones of its present registration, whatever their settings."""
+    record_path = work / "wrinkles" / "pairs" / "stage.json"
+    record = read_json(record_path) if record_path.is_file() else {}
+    finished = record.get("status") == "complete"
+    if not finished or record["upstream"].get("registration") != registered_digest(work):
+        run(work, config, workers=workers)
+
+
+def _length(job: _Run) -> int:
+    return len(job.positions)
+
+
+@lru_cache(maxsize=1)
+def _template(work: Path, config: PairConfig) -> MapTemplate:
+    """One analysis per process and take."""
+    return MapTemplate.create(load_registration(work / "registration").garment, config.map)
+
+
+def _make(config: PairConfig, job: _Run) -> int:
+    """Make and write the missing frames of a run; how many there were."""
+    template = _template(job.work, config)
+    sequence = load_registration(job.work / "registration")
+    frame_ids, failed = sequence.frame_ids.tolist(), failed_frames(job.work)
+    pending = set(job.stage.pending([frame_ids[p] for p in job.positions], ".png", folder="high"))
+    missing = [position for position in job.positions if frame_ids[position] in pending]
+
+    def scan(position: int) -> Mesh | None:
+        frame_id = frame_ids[position]
+        if frame_id in failed:
+            return None
+        return load_garment_scan(job.work / "garment" / "frames" / f"{frame_id:06d}.npz", frame_id).mesh
+
+    pairs = frame_pairs(
+        template, frame_ids, range(missing[0], missing[-1] + 1),
+        vertices=lambda position: np.array(sequence.vertices[position]), scan=scan, fps=job.fps,
+        config=config.projection,
+    )  # fmt: skip
+    for pair in pairs:
+        _write(job.stage, template, sequence, pair)
+    return len(missing)
+
+
+def _write(stage: Stage, template: MapTemplate, sequence: RegisteredSequence, pair: FramePair) -> None:
+    """The high map last: with it the frame counts as done."""
+    raster, valid = template.raster, pair.high.valid
+    vertices = np.array(sequence.vertices[sequence.frame_ids.tolist().index(pair.frame_id)])
+    rotation = template.rotation(vertices).astype(np.float32)
+    shown = raster.image(np.ones(len(valid), bool))
+    angle = np.degrees(np.arccos(np.clip((pair.low * pair.high.normals).sum(axis=1), -1, 1)))
+    measured = valid & raster.inside
+    write_json(
+        stage.frame_path(pair.frame_id, ".json", folder="metrics"),
+        {
+            "frame_id": pair.frame_id,
+            "valid_percent": 100 * float(measured.sum() / max(raster.inside.sum(), 1)),
+            "difference_deg": float(angle[measured].mean()) if measured.any() else None,
+        },
+    )
+    low = encode_png(raster.image(pair.low @ rotation), shown)
+    high = encode_png(raster.image(pair.high.normals @ rotation), raster.image(valid))
+    write_bytes(stage.frame_path(pair.frame_id, ".png", folder="low"), low)
+    write_bytes(stage.frame_path(pair.frame_id, ".png", folder="high"), high)

@@ -1,0 +1,200 @@
+"""The stage that trains the wrinkle GAN: pairs of one or more work folders in, a MODEL folder out.
+
+stage.json                 what was run
+generator.safetensors      the weights, with what is needed to rebuild the network
+checkpoints/000500.safetensors   everything a resume needs; the last two are kept
+metrics.jsonl              losses, one line every `log_every` steps
+samples/000500.png         held-out frames: input, made, true
+held_out.json              measures on the held-out frames: of the maps made, and of the low maps
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import safetensors.torch
+import torch
+from safetensors import SafetensorError
+
+from capture4d.errors import InputError
+from capture4d.uv_layout import millimetres_per_texel
+from capture4d.workdir import Stage, open_stage, progress, require_complete, write_bytes, write_json
+from wrinkles.config import PairConfig, WrinkleConfig
+from wrinkles.inference import WrinkleModel, model_bytes
+from wrinkles.map_metrics import MapScores, score
+from wrinkles.map_spaces import to_colours
+from wrinkles.pair_files import layout_digest, load_pairs, pair_template
+from wrinkles.pair_stage import ensure_pairs
+from wrinkles.pair_stage import run as make_pairs
+from wrinkles.pairs import PairTake, batches, fitted, split
+from wrinkles.training import TrainingState, load_tensors, new_state, state_tensors, train_step
+
+__all__ = ["run", "score_take"]
+
+SCHEMA = 1
+KEPT_CHECKPOINTS = 2
+SAMPLES = 4
+
+
+def run(
+    works: Sequence[Path],
+    output: Path,
+    config: WrinkleConfig,
+    *,
+    pairs: PairConfig | None = None,
+    workers: int = 1,
+    overwrite: bool = False,
+) -> str:
+    """Make the pairs that are missing, train, measure; the digest of the result.
+
+    Pairs that are there are used as they are, unless `pairs` asks for other than the default.
+
+    Equal inputs, settings and numbers of `workers`, which are torch's threads here, give equal weights, however often
+    the run was interrupted.
+
+    Raises:
+        InputError: no or differing takes, or a checkpoint of another architecture.
+    """
+    if not works:
+        raise InputError("wrinkles train: expected at least one work folder, found none")
+    for work in works:
+        if pairs is None or pairs == PairConfig():
+            ensure_pairs(work, PairConfig(), workers=workers)
+        else:
+            make_pairs(work, pairs, workers=workers)
+    upstream = {
+        work.name: require_complete(work / "wrinkles" / "pairs", "pairs", f"capture4d wrinkles maps {work}")
+        for work in works
+    }
+    if len(upstream) < len(works):
+        raise InputError("wrinkles train: expected work folders of different names, found two alike")
+    takes = [load_pairs(work) for work in works]
+    mesh, size = pair_template(works[0]), takes[0].low.shape[-1]
+    digest = layout_digest(mesh, size)
+    for work, take in zip(works, takes, strict=True):
+        if layout_digest(pair_template(work), take.low.shape[-1]) != digest:
+            raise InputError(
+                f"{work}: expected the UV layout of {works[0]}, found another; one network needs one layout"
+            )
+    stage = open_stage(
+        output, name="train-wrinkles", schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite
+    )
+    torch.set_num_threads(workers)
+    parts = [split(fitted(take, config.texels), held_out=config.held_out, gap=config.held_out_gap) for take in takes]
+    state = new_state(config)
+    _resume(stage, state)
+    _train(stage, state, [train for train, _ in parts], [held for _, held in parts], config)
+    model = WrinkleModel(state.generator, config.network, texels=config.texels, map_size=size, layout_digest=digest)
+    write_bytes(stage.path / "generator.safetensors", model_bytes(model))
+    mm_per_texel = millimetres_per_texel(mesh, config.texels)
+    measured = {}
+    for _, held in parts:
+        if len(held.frame_ids):
+            made, low = score_take(model, held, mm_per_texel)
+            measured[held.name] = {"made": _json(made), "low": _json(low)}
+    write_json(stage.path / "held_out.json", measured)
+    return stage.finish([stage.path / "generator.safetensors"])
+
+
+def score_take(model: WrinkleModel, take: PairTake, mm_per_texel: float) -> tuple[MapScores, MapScores]:
+    """Measures of generated maps, and of their inputs, against the high maps of a take."""
+    made = torch.stack([model.generate(low.float()) for low in take.low])
+    truth, consecutive = take.high.float(), torch.zeros(len(made), dtype=torch.bool)
+    consecutive[torch.from_numpy(take.consecutive())] = True
+
+    def against_truth(maps: torch.Tensor) -> MapScores:
+        return score(maps, truth, take.valid, mm_per_texel=mm_per_texel, consecutive=consecutive)
+
+    return against_truth(made), against_truth(take.low.float())
+
+
+def _train(
+    stage: Stage, state: TrainingState, train: list[PairTake], held: list[PairTake], config: WrinkleConfig
+) -> None:
+    schedule = config.schedule
+    rows = _logged(stage.path / "metrics.jsonl", state.step)
+    stream = batches(train, size=schedule.batch, seed=config.seed, start=state.step)
+    recent: list[dict[str, float]] = []
+    with progress("train", schedule.steps, completed=state.step) as advance:
+        while state.step < schedule.steps:
+            recent.append(train_step(state, next(stream), config))
+            advance(1)
+            last = state.step == schedule.steps
+            if state.step % schedule.log_every == 0 or last:
+                mean = {name: float(np.mean([losses[name] for losses in recent])) for name in recent[0]}
+                rows.append({"step": state.step, **mean})
+                recent.clear()
+            if state.step % schedule.sample_every == 0 or last:
+                _write_samples(stage, state, held, config)
+            if state.step % schedule.checkpoint_every == 0 or last:
+                _write_log(stage.path / "metrics.jsonl", rows)
+                _save(stage, state)
+
+
+def _checkpoint(stage: Stage, step: int) -> Path:
+    return stage.path / "checkpoints" / f"{step:06d}.safetensors"
+
+
+def _save(stage: Stage, state: TrainingState) -> None:
+    write_bytes(_checkpoint(stage, state.step), safetensors.torch.save(state_tensors(state)))
+    for old in sorted((stage.path / "checkpoints").glob("*.safetensors"))[:-KEPT_CHECKPOINTS]:
+        old.unlink()
+
+
+def _resume(stage: Stage, state: TrainingState) -> None:
+    """Go on from the newest checkpoint, if there is one."""
+    paths = sorted((stage.path / "checkpoints").glob("*.safetensors"))
+    if not paths:
+        return
+    try:
+        tensors = safetensors.torch.load(paths[-1].read_bytes())
+    except SafetensorError as error:
+        raise InputError(f"{paths[-1]}: not a readable checkpoint, cut off or damaged ({error})") from None
+    load_tensors(state, tensors, source=str(paths[-1]))
+
+
+def _logged(path: Path, step: int) -> list[dict[str, float]]:
+    """Rows up to a step; what was logged after the last checkpoint is done again."""
+    if not path.is_file():
+        return []
+    rows = [json.loads(line) for line in path.read_text().splitlines()]
+    return [row for row in rows if row["step"] <= step]
+
+
+def _write_log(path: Path, rows: Sequence[dict[str, float]]) -> None:
+    write_bytes(path, "".join(json.dumps(row) + "\n" for row in rows).encode())
+
+
+def _write_samples(stage: Stage, state: TrainingState, held: list[PairTake], config: WrinkleConfig) -> None:
+    """A sheet of held-out frames, a row each: input, made, true. Leaves the random state as it was."""
+    frames = [(take, at) for take in held for at in range(len(take.frame_ids))]
+    if not frames:
+        return
+    chosen = [frames[int(at)] for at in np.linspace(0, len(frames) - 1, min(SAMPLES, len(frames)))]
+    random = torch.get_rng_state()
+    state.generator.eval()
+    rows = []
+    with torch.inference_mode():
+        for take, at in chosen:
+            low = take.low[at].float()
+            made = state.generator(low[None])[0] * (low != 0).any(dim=0)
+            row = torch.cat([low, made, take.high[at].float()], dim=2)
+            rows.append(to_colours(row.permute(1, 2, 0).numpy()))
+    torch.set_rng_state(random)
+    write_bytes(stage.path / "samples" / f"{state.step:06d}.png", _png(np.concatenate(rows)))
+
+
+def _png(picture: np.ndarray) -> bytes:
+    import cv2
+
+    good, data = cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]))
+    assert good
+    return data.tobytes()
+
+
+def _json(scores: MapScores) -> dict[str, float | None]:
+    return {name: value if np.isfinite(value) else None for name, value in asdict(scores).items()}
