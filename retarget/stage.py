@@ -260,7 +260,7 @@ def _regressors(
 ) -> dict[str, Any]:
     """Learn what is not there yet, and measure all of it."""
     digest = _digest(stage.path)
-    clips = {role: regression_clips(takes, pieces, role, layout, space) for role in ROLES}
+    clips: dict[Role, list[Clip]] = {role: regression_clips(takes, pieces, role, layout, space) for role in ROLES}
     linear = fit_linear(clips["training"], clips["validation"], layout, space.std, config.linear)
     save_linear(stage.path / LINEAR, linear, model_digest=digest)
     regressors: dict[str, Regressor] = {"linear": linear}
