@@ -19,6 +19,7 @@ __all__ = [
     "connected_components",
     "face_areas",
     "face_normals",
+    "normalised",
     "submesh",
     "unique_edges",
     "vertex_adjacency",
@@ -31,14 +32,15 @@ def _doubled_area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray
     return np.cross(along - corner, across - corner)
 
 
-def _normalised(vectors: np.ndarray) -> np.ndarray:
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+def normalised(vectors: np.ndarray) -> np.ndarray:
+    """Vectors along the last axis at unit length; zero stays zero."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
 
 
 def face_normals(vertices: Float[np.ndarray, "V 3"], faces: Integer[np.ndarray, "F 3"]) -> Float[np.ndarray, "F 3"]:
     """Unit normals; zero for a face without area."""
-    return _normalised(_doubled_area_vectors(vertices, faces))
+    return normalised(_doubled_area_vectors(vertices, faces))
 
 
 def face_areas(vertices: Float[np.ndarray, "V 3"], faces: Integer[np.ndarray, "F 3"]) -> Float[np.ndarray, " F"]:
@@ -53,7 +55,7 @@ def vertex_normals(vertices: Float[np.ndarray, "V 3"], faces: Integer[np.ndarray
     total = np.empty_like(vertices)
     for axis in range(3):
         total[:, axis] = np.bincount(corners, np.repeat(weighted[:, axis], 3), minlength=len(vertices))
-    return _normalised(total)
+    return normalised(total)
 
 
 def _half_edges(faces: np.ndarray) -> np.ndarray:

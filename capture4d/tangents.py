@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int32
 
-from capture4d.mesh import connected_components, vertex_normals
+from capture4d.mesh import connected_components, normalised, vertex_normals
 from capture4d.uv_raster import UvRaster
 
 __all__ = ["TangentLayout", "corner_tangents", "interpolated_frames", "tangent_frames", "uv_corners"]
@@ -63,9 +63,9 @@ class TangentLayout:
         edges = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=1)
         flat = np.einsum("fe,fec->fc", self._of_edges, edges)
         normal = normals[self.faces].astype(np.float64)
-        projected = _unit(flat[:, None] - np.einsum("fc,fkc->fk", flat, normal)[..., None] * normal)
-        onward = _unit(np.roll(corners, -1, axis=1) - corners)
-        back = _unit(np.roll(corners, 1, axis=1) - corners)
+        projected = normalised(flat[:, None] - np.einsum("fc,fkc->fk", flat, normal)[..., None] * normal)
+        onward = normalised(np.roll(corners, -1, axis=1) - corners)
+        back = normalised(np.roll(corners, 1, axis=1) - corners)
         angle = np.arccos(np.clip(np.einsum("fkc,fkc->fk", onward, back), -1, 1))
         total = np.stack(
             [
@@ -78,7 +78,7 @@ class TangentLayout:
         mean -= np.einsum("fkc,fkc->fk", mean, normal)[..., None] * normal
         lost = np.linalg.norm(mean, axis=-1, keepdims=True) < 1e-9
         instead = _some_orthogonal(normal) if fallback is None else fallback[self.faces]
-        return _unit(np.where(lost, instead, mean))
+        return normalised(np.where(lost, instead, mean))
 
 
 def corner_tangents(
@@ -108,16 +108,11 @@ def interpolated_frames(
     normals: Float[np.ndarray, "N 3"], tangents: Float[np.ndarray, "N 3"], signs: Float[np.ndarray, " N"]
 ) -> Float64[np.ndarray, "N 3 3"]:
     """Frames from interpolated normals and tangents: rows tangent, bitangent, normal."""
-    normal = _unit(np.asarray(normals, np.float64))
+    normal = normalised(np.asarray(normals, np.float64))
     tangent = tangents - np.einsum("nc,nc->n", tangents, normal)[:, None] * normal
     lost = np.linalg.norm(tangent, axis=-1, keepdims=True) < 1e-9
-    tangent = _unit(np.where(lost, _some_orthogonal(normal), tangent))
+    tangent = normalised(np.where(lost, _some_orthogonal(normal), tangent))
     return np.stack([tangent, signs[:, None] * np.cross(normal, tangent), normal], axis=1)
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
 
 
 def _some_orthogonal(normals: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64
 
 from capture4d.errors import InputError
-from capture4d.mesh import vertex_normals
+from capture4d.mesh import normalised, vertex_normals
 from capture4d.tangents import TangentLayout, tangent_frames
 from capture4d.types import Garment, Mesh
 from capture4d.uv_layout import unit_square
@@ -47,7 +47,7 @@ class MapTemplate:
     def low_normals(self, vertices: Float[np.ndarray, "V 3"]) -> Float32[np.ndarray, "N 3"]:
         """The template's interpolated vertex normals in a frame: unit, world, per texel."""
         normals = vertex_normals(np.asarray(vertices, np.float64), self.mesh.faces)
-        return _unit(self.raster.at_vertices(normals)).astype(np.float32)
+        return normalised(self.raster.at_vertices(normals)).astype(np.float32)
 
     def frames(self, vertices: Float[np.ndarray, "V 3"]) -> Float64[np.ndarray, "N 3 3"]:
         """Tangent frames per texel: rows tangent, bitangent, normal."""
@@ -122,8 +122,3 @@ def frame_pairs(
         centre = position - window.start
         high = combine_frames([entry[2] for entry in entries], centre, template.raster, scaled)
         yield FramePair(int(frame_ids[position]), entries[centre][1], high)
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64
 
 from capture4d.errors import InputError
+from capture4d.mesh import normalised
 from capture4d.mesh_kernels import laplacian_pass, open_vertices, vertex_normals_kernel
 from capture4d.open3d_loading import import_open3d
 from capture4d.types import Mesh
@@ -70,7 +71,7 @@ def project_scan(
         near = (distance <= config.distance_m) & (distance < nearest[index])
         index, distance, face, uv = index[near], distance[near], face[near], uv[near]
         weights = np.column_stack([1 - uv.sum(axis=1), uv])
-        normal = _unit(np.einsum("nk,nkc->nc", weights, scan_normals[scan.faces[face]]))
+        normal = normalised(np.einsum("nk,nkc->nc", weights, scan_normals[scan.faces[face]]))
         good = (np.einsum("nc,nc->n", normal, normals[index]) >= gate) & trusted[face]
         index = index[good]
         found[index], valid[index], nearest[index] = normal[good], True, distance[good]
@@ -107,10 +108,10 @@ def combine_frames(
     total = np.zeros((len(own.valid), 3))
     for normals, frame in frames:
         total += np.einsum("nrc,nc->nr", frame, normals.normals) * normals.valid[:, None]
-    local = _unit(total)
+    local = normalised(total)
     if config.blur_texels > 0:
         local = _masked_blur(local, own.valid, raster, config.blur_texels)
-    world = np.einsum("nrc,nr->nc", basis, _unit(local))
+    world = np.einsum("nrc,nr->nc", basis, normalised(local))
     return TexelNormals((world * own.valid[:, None]).astype(np.float32), own.valid)
 
 
@@ -126,7 +127,7 @@ def _scan_surface(scan: Mesh, config: ProjectionConfig) -> tuple[np.ndarray, np.
         ring[scan.faces[outer[scan.faces].any(axis=1)]] = True
         outer = ring
     trusted = ~outer[scan.faces].any(axis=1) if config.border_rings else np.ones(len(scan.faces), bool)
-    return _unit(normals).astype(np.float32), trusted
+    return normalised(normals).astype(np.float32), trusted
 
 
 def _masked_blur(values: np.ndarray, valid: np.ndarray, raster: UvRaster, sigma: float) -> np.ndarray:
@@ -135,8 +136,3 @@ def _masked_blur(values: np.ndarray, valid: np.ndarray, raster: UvRaster, sigma:
     blurred = cv2.GaussianBlur(image, (0, 0), sigma)
     blurred_weight = cv2.GaussianBlur(weight, (0, 0), sigma)
     return raster.read(blurred) / np.maximum(raster.read(blurred_weight), 1e-6)[:, None]
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 1e-12)
