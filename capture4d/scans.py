@@ -167,9 +167,11 @@ def format_colour(colour: Colour) -> str:
     return "#{:02x}{:02x}{:02x}".format(*colour)
 
 
-def read_capture(path: str | Path) -> Capture:
+def read_capture(path: str | Path, *, scans: bool = True) -> Capture:
     """Read `capture.json`, and see that every frame it names has a scan.
 
+    Args:
+        scans: False for a take that was simulated and never scanned.
     Raises:
         InputError: the folder, the description or a scan is missing, or the description is wrong.
     """
@@ -200,7 +202,7 @@ def read_capture(path: str | Path) -> Capture:
     except (AttributeError, TypeError, ValueError) as error:
         raise InputError(f"{description}: {error}") from None
     missing = [frame_id for frame_id in capture.frame_ids if frame_id not in present]
-    if missing:
+    if scans and missing:
         raise InputError(
             f"{path / 'scans' / f'{missing[0]:06d}.ply'}: no such scan; {len(missing)} of "
             f"{len(capture.frame_ids)} frames in capture.json have none"
