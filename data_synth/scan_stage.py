@@ -41,7 +41,7 @@ from data_synth.scanner_config import ScanConfig
 
 __all__ = ["run"]
 
-SCHEMA = 1
+SCHEMA = 2
 ROTATIONS = {
     "x": [[0, 1, 0], [1, 0, 0], [0, 0, -1]],
     "y": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],

@@ -56,7 +56,7 @@ __all__ = [
     "take_surfaces",
 ]
 
-SCHEMA = 1
+SCHEMA = 2
 BORDER_BAND_M = 0.009
 """Width of the painted border."""
 RIG_RADIUS_M = 0.58
