@@ -88,7 +88,7 @@ def border_distances(
 ) -> Float64[np.ndarray, " distances"]:
     """Distances, metres, from border vertices to painted points and from painted points to the border curve.
 
-    Points of one loop are compared with that loop where the paint tells. Border vertices without painted points nearby
+    Points of one loop are compared with that loop where the paint tells, others with the loops that no point names. Border vertices without painted points nearby
     are left out: there the scan does not show the border. A border that is far from its paint is noticed by the paint.
     """
     border = analysis.border
