@@ -192,8 +192,6 @@ class QualityConfig:
 class RegistrationConfig:
     """Everything the registration stage reads."""
 
-    mode: Literal["default", "paper"] = "default"
-    """default: annealed weights and a dense stage; paper: DeepWrinkles as printed, constant weights, no dense stage."""
     graph: GraphConfig = field(default_factory=GraphConfig)
     solver: LinearSolverConfig = field(default_factory=LinearSolverConfig)
     data: DataConfig = field(default_factory=DataConfig)
@@ -208,7 +206,6 @@ PAPER_SCHEDULE = Schedule(30, (0.12, 0.12), rigid=(500.0, 500.0), smooth=(500.0,
 NO_STEPS = Schedule(0, (0.03, 0.012))
 
 PAPER = RegistrationConfig(
-    mode="paper",
     graph=GraphConfig(nodes=800, vertices=0),
     data=DataConfig(point_share=1.0, smoothing_passes=0),
     boundary=BoundaryConfig(coarse_rule="argmax", dense_rule="argmax", along_curve=False),
@@ -218,6 +215,8 @@ PAPER = RegistrationConfig(
 )
 
 PRESETS: Mapping[str, RegistrationConfig] = {"default": RegistrationConfig(), "paper": PAPER}
+
+"""DeepWrinkles as printed: constant weights, no dense stage."""
 
 SOFT = RegistrationConfig(
     graph=GraphConfig(nodes=300, vertices=0),
