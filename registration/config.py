@@ -247,7 +247,8 @@ class MeshRegistrationConfig:
     boundary_colour: str = ""
     """Paint on the scan's borders, RRGGBB; empty where none is painted."""
     units: Literal["m", "cm", "mm", "auto"] = "auto"
-    """Of both files; decides the millimetres of the report, never the result."""
+    """Of both files; decides the millimetres of the report, never the result. auto: metres if the template's bounding
+    box is less than 8 across, centimetres if less than 200, else millimetres."""
     align: Literal["none", "rigid", "similarity"] = "none"
     """Move the template onto the scan first, with scale for similarity; none if the two already lie on each other."""
     registration: RegistrationConfig = SOFT

@@ -178,7 +178,12 @@ def _register_one(
         fitted = register_frame(analysis, scan, start, config=config, schedule=schedule)
     except InputError as error:
         return FrameResult(
-            frame_id, start.astype(np.float32), _failure(len(start), str(error)), name, 0, time.process_time() - begin
+            frame_id,
+            start.astype(np.float32),
+            FrameQuality.unmeasured(len(start), str(error)),
+            name,
+            0,
+            time.process_time() - begin,
         )
     vertices = fitted.vertices.astype(np.float32)
     quality = assess(analysis, scan, vertices.astype(np.float64), config.quality)
@@ -246,7 +251,3 @@ def _share_of_carried(analysis: TemplateAnalysis, carried: np.ndarray, previous:
         squares.append(total)
     share = squares[1] / np.maximum(squares[0] + squares[1], 1e-30)
     return np.einsum("vk,vk->v", weights, share[nodes])
-
-
-def _failure(count: int, reason: str) -> FrameQuality:
-    return FrameQuality("failed", (reason,), np.full(count, np.nan), {})
