@@ -48,8 +48,8 @@ def border_targets(
     Args:
         border: template border vertices, metres.
         loops: the loop of each border vertex.
-        scan_loops: the loop of each painted point where the paint tells, else -1; then it votes among the loops that no point
-            names.
+        scan_loops: the loop of each painted point where the paint tells, else -1; then it votes among the loops that no
+            point names.
         gate: farthest voter, metres.
     """
     points = border.copy()

@@ -128,6 +128,8 @@ class CoarseConfig:
     them, and where cloth bunches the template's distances push it off its place."""
     compression: float = 0.3
     """Share of the stretch weight that resists shortening, in the warm schedule."""
+    cold_compression: float = 1.0
+    """The same in the cold schedule, where nodes are held to the template's distances."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,9 +216,9 @@ PAPER = RegistrationConfig(
     sequence=SequenceConfig(start="skinned", carry=0.0),
 )
 
-PRESETS: Mapping[str, RegistrationConfig] = {"default": RegistrationConfig(), "paper": PAPER}
-
 """DeepWrinkles as printed: constant weights, no dense stage."""
+
+PRESETS: Mapping[str, RegistrationConfig] = {"default": RegistrationConfig(), "paper": PAPER}
 
 SOFT = RegistrationConfig(
     graph=GraphConfig(nodes=300, vertices=0),
@@ -230,6 +232,7 @@ SOFT = RegistrationConfig(
     ),
     coarse=CoarseConfig(
         cold=Schedule(40, (0.3, 0.12), rigid=(0.1, 0.01), smooth=(1000.0, 1.0)),
+        cold_compression=0.5,
     ),
     dense=DenseConfig(
         cold=Schedule(40, (0.12, 0.06), smooth=(30.0, 0.05)),
