@@ -234,8 +234,10 @@ def _scan_frame(stage: Stage, source: _Source, same_topology: bool, frame_id: in
     """Scan one mesh; truth first, for the frame counts as done once its scan is there."""
     config = source.config
     mesh = source.mesh(frame_id)
-    sheet = _painted(source) if same_topology else _paint(mesh, config)
-    surface = Surface(sheet.posed(mesh.vertices), sheet.colours, LABEL_GARMENT, config.scanner.fusion.garment_voxel_m)
+    sheet = _painted(source) if same_topology else _paint(mesh, _first(source), config)
+    surface = Surface(
+        sheet.posed(mesh.vertices), sheet.colours, LABEL_GARMENT, config.scanner.fusion.garment_voxel_m, sheet.painted
+    )
     scan, labels = scan_surfaces(
         load_rig(stage.path / "rig.json"),
         [surface],

@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -322,12 +323,11 @@ def _measured_poses(take: Take) -> PoseSequence:
     )
 
 
-def paint_garment(mesh: PanelMesh, outfit: Outfit) -> np.ndarray:
-    """sRGB per vertex, (V, 3) uint8: the garment's colour, and a painted band along every border of the pattern."""
+def painted_band(mesh: PanelMesh) -> np.ndarray:
+    """The vertices, (V,) bool, in the painted band along every border of the pattern."""
     border = np.concatenate(list(mesh.loops.values()))
     corners = np.isin(mesh.faces, border)
-    painted = KDTree(mesh.uv[corners]).query(mesh.vertex_uv, distance_upper_bound=BORDER_BAND_M)[0] < BORDER_BAND_M
-    return np.where(painted[:, None], outfit.border, outfit.garment).astype(np.uint8)
+    return KDTree(mesh.uv[corners]).query(mesh.vertex_uv, distance_upper_bound=BORDER_BAND_M)[0] < BORDER_BAND_M
 
 
 def dress_colours(shaped: ShapedBody, outfit: Outfit) -> np.ndarray:
@@ -345,11 +345,11 @@ def take_rig(config: SynthConfig, extent: np.ndarray) -> Rig:
 
 def take_surfaces(take: Take, fine: np.ndarray, surface: np.ndarray) -> list[Surface]:
     """What the scanner sees of a frame: the painted garment, (V, 3), and the body in its suit, (B, 3); float32."""
-    fusion, outfit = take.config.scanner.fusion, OUTFITS[take.config.outfit]
+    fusion, (cloth, painted, dress) = take.config.scanner.fusion, _colours(take)
     faces = take.shaped.body.template.faces
     return [
-        Surface(Mesh(fine, take.fine.faces), paint_garment(take.fine, outfit), LABEL_GARMENT, fusion.garment_voxel_m),
-        Surface(Mesh(surface, faces), dress_colours(take.shaped, outfit), LABEL_BODY, fusion.body_voxel_m),
+        Surface(Mesh(fine, take.fine.faces), cloth, LABEL_GARMENT, fusion.garment_voxel_m, painted),
+        Surface(Mesh(surface, faces), dress, LABEL_BODY, fusion.body_voxel_m),
     ]
 
 
@@ -396,6 +396,14 @@ def _write_quality(stage: Stage, frame_ids: list[int]) -> None:
     ]
     write_json(path, rows)
     bad = [row for row in rows if row["reasons"]]
+@lru_cache(maxsize=1)
+def _colours(take: Take) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of the garment (V, 3), where it is painted (V,), and of the body (B, 3): the same in every frame of a take."""
+    outfit, painted = OUTFITS[take.config.outfit], painted_band(take.fine)
+    cloth = np.where(painted[:, None], outfit.border, outfit.garment).astype(np.uint8)
+    return cloth, painted, dress_colours(take.shaped, outfit)
+
+
     for row in bad[:10]:
         print(f"frame {row['frame_id']}: {'; '.join(row['reasons'])}")
     if len(bad) > 10:
