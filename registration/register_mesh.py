@@ -18,7 +18,7 @@ from jaxtyping import Float32, Float64
 from capture4d.errors import InputError
 from capture4d.garment_extraction import painted_border
 from capture4d.mesh import boundary_loops, submesh
-from capture4d.mesh_files import read_mesh, write_mesh
+from capture4d.mesh_files import MESH_SUFFIXES, read_mesh, write_mesh
 from capture4d.scans import parse_colour
 from capture4d.types import Garment, GarmentScan, Mesh
 from capture4d.workdir import write_json
@@ -55,10 +55,14 @@ def run(template_path: Path, scan_path: Path, output_path: Path, config: MeshReg
     Args:
         output_path: .ply, .obj or .glb; the JSON has the same name.
     Raises:
-        InputError: a file is missing, damaged or empty, the colour is not in the scan, or the sizes cannot belong to
-            one unit.
+        InputError: the output is no mesh file, an input is missing, damaged or empty, the colour is not in the scan, or
+            the sizes cannot belong to one unit.
     """
     begin = time.process_time()
+    if output_path.suffix.lower() not in MESH_SUFFIXES:
+        raise InputError(
+            f"{output_path}: expected a mesh file ({', '.join(MESH_SUFFIXES)}), found '{output_path.suffix}'"
+        )
     template_file, scan_file = read_mesh(template_path), read_mesh(scan_path)
     result = register_mesh(
         template_file.mesh,
