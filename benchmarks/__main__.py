@@ -2,7 +2,7 @@
 `--list` prints the names.
 
 --quick measures the same keys on a smaller case; --json also writes the metrics to FILE; --gate exits with 1 if one
-is worse than benchmarks/baseline.json allows.
+is worse than benchmarks/baseline.json allows: its entry NAME, NAME-quick, or with --data NAME-DATA and NAME-DATA-quick.
 
 A benchmark is a module of this package with a function `run(*, quick: bool = False, ...) -> list[Metric]`; its other
 keyword arguments become its options.
@@ -11,9 +11,11 @@ keyword arguments become its options.
 from __future__ import annotations
 
 import importlib
+import inspect
 import pkgutil
 import sys
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -51,10 +53,23 @@ def main(arguments: list[str]) -> int:
         write_metrics(outlet.json, metrics)
     if not outlet.gate:
         return 0
-    broken = broken_limits(f"{name}-quick" if "--quick" in rest else name, metrics)
+    broken = broken_limits(baseline_name(name, run, rest), metrics)
     for line in broken:
         print(f"gate: {line}", file=sys.stderr)
     return 1 if broken else 0
+
+
+def baseline_name(name: str, run: Callable[..., list[Metric]], options: Sequence[str]) -> str:
+    """The entry of the baseline that a run is held to: NAME, NAME-DATA for other data than usual, and -quick."""
+    usual = inspect.signature(run).parameters.get("data")
+    given = [option.split("=", 1) for option in options]
+    for index, option in enumerate(given):
+        if usual is None or option[0] != "--data":
+            continue
+        data = option[1] if len(option) > 1 else options[index + 1]
+        if data != usual.default:
+            name = f"{name}-{data}"
+    return f"{name}-quick" if "--quick" in options else name
 
 
 def _names() -> list[str]:

@@ -173,7 +173,7 @@ def _scan(take: _Take, case: _Case, dressed: _Dressed, seed: int) -> tuple[Scan,
     sheet = _painted(take, case.outfit, fusion.garment_voxel_m)
     suit = np.where(take.bare[:, None], outfit.skin, outfit.suit).astype(np.uint8)
     surfaces = [
-        Surface(sheet.posed(dressed.cloth), sheet.colours, LABEL_GARMENT, fusion.garment_voxel_m),
+        Surface(sheet.posed(dressed.cloth), sheet.colours, LABEL_GARMENT, fusion.garment_voxel_m, sheet.painted),
         Surface(Mesh(dressed.body, take.faces), suit, LABEL_BODY, fusion.body_voxel_m),
     ]
     centre, radius = bounding_sphere(dressed.cloth)

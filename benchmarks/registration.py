@@ -161,7 +161,8 @@ def _take(folder: Path, scratch: Path, compared: int, *, start: Literal["skinned
     extract(folder, scratch / "garment")
     peak_mb = _peak_rss(folder, scratch / "garment", scratch / "registration")
     third = _first_frames(capture, scratch / "short", max(2, len(capture.frame_ids) // 3))
-    short_mb = _peak_rss(third, None, scratch / "short-work")
+    extract(third, scratch / "short-garment")
+    short_mb = _peak_rss(third, scratch / "short-garment", scratch / "short-registration")
     records = [read_json(path) for path in sorted((scratch / "registration" / "metrics").glob("*.json"))]
     garment = read_template(capture)
 
@@ -296,17 +297,13 @@ def _median(values: Sequence[float]) -> float:
 # --- memory ------------------------------------------------------------------------------------------------------
 
 
-def _peak_rss(capture: Path, garment: Path | None, output: Path) -> float:
-    """Largest resident set of a process that registers the capture, MB."""
+def _peak_rss(capture: Path, garment: Path, output: Path) -> float:
+    """Largest resident set of a process that registers the capture and does nothing else, MB."""
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
         return pool.submit(_register_and_measure, capture, garment, output).result()
 
 
-def _register_and_measure(capture: Path, garment: Path | None, output: Path) -> float:
-    if garment is None:
-        garment = output / "garment"
-        extract(capture, garment)
-        output = output / "registration"
+def _register_and_measure(capture: Path, garment: Path, output: Path) -> float:
     register(capture, garment, output, RegistrationConfig(), workers=1)
     return peak_rss_mb()
 

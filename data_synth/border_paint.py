@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float32, Int32, UInt8
+from jaxtyping import Bool, Float, Float32, Int32, UInt8
 from scipy import sparse
 from scipy.spatial import KDTree
 
@@ -24,7 +24,9 @@ class PaintedSheet:
     """(V', V): vertices of the refined mesh from those of the original; every row is a point of a face."""
     faces: Int32[np.ndarray, "faces 3"]
     colours: UInt8[np.ndarray, "refined 3"]
-    loops: tuple[Int32[np.ndarray, " loop"], ...]
+    painted: Bool[np.ndarray, " refined"]
+    """Vertices in a painted band."""
+    loops: tuple[Int32[np.ndarray, " _"], ...]
     """Border loops of the original mesh, the longest first."""
 
     def posed(self, vertices: Float32[np.ndarray, "verts 3"]) -> Mesh:
@@ -40,7 +42,7 @@ def paint_borders(
     border_colours: Sequence[tuple[int, int, int]],
     max_edge_m: float,
 ) -> PaintedSheet:
-    """Paint a band of `width_m` along every border loop; colours serve the loops in turn.
+    """Paint a band of `width_m` along every border loop; colours serve the loops, the longest first, in turn.
 
     The paint belongs to the material: measure it once, on the mesh at rest, and reuse the result for every pose. A
     width of 0 or no colours leave the mesh as it is.
@@ -48,8 +50,8 @@ def paint_borders(
     loops = tuple(boundary_loops(mesh.faces))
     refine = sparse.eye_array(len(mesh.vertices), format="csr").astype(np.float32)
     faces, vertices = mesh.faces, mesh.vertices.astype(float)
-    painted = width_m > 0 and bool(border_colours) and bool(loops)
-    while painted:
+    has_paint = width_m > 0 and bool(border_colours) and bool(loops)
+    while has_paint:
         lengths = np.linalg.norm(vertices[faces] - vertices[np.roll(faces, 1, axis=1)], axis=2).max(axis=1)
         distance = _distance_to_loops(mesh, loops, vertices).min(axis=1)
         chosen = (lengths > max_edge_m) & (distance[faces].min(axis=1) < width_m + lengths)
@@ -59,12 +61,15 @@ def paint_borders(
         refine = sparse.vstack([refine, midpoints @ refine], format="csr")
         vertices = refine @ mesh.vertices.astype(float)
     colours = np.tile(np.array(garment_colour, np.uint8), (len(vertices), 1))
-    if painted:
+    painted = np.zeros(len(vertices), bool)
+    if has_paint:
         distance = _distance_to_loops(mesh, loops, vertices)
         for index in range(len(loops)):
             band = (distance[:, index] <= width_m) & (distance.argmin(axis=1) == index)
-            colours[_connected_to(faces, band, distance[:, index] < 1e-9)] = border_colours[index % len(border_colours)]
-    return PaintedSheet(sparse.csr_array(refine), faces, colours, loops)
+            band = _connected_to(faces, band, distance[:, index] < 1e-9)
+            colours[band] = border_colours[index % len(border_colours)]
+            painted |= band
+    return PaintedSheet(sparse.csr_array(refine), faces, colours, painted, loops)
 
 
 def _distance_to_loops(

@@ -25,6 +25,8 @@ class MeshSequence:
     path: Path
     files: Mapping[int, Path]
     """Mesh file of each frame number; all the same npz if the sequence is one."""
+    arrays: tuple[np.ndarray, np.ndarray] | None = None
+    """Vertices (T, V, 3) and faces (F, 3) of an npz: read once, for it has to be unpacked whole."""
 
     @property
     def frame_ids(self) -> tuple[int, ...]:
@@ -33,10 +35,13 @@ class MeshSequence:
     def read(self, frame_id: int) -> Mesh:
         """One frame's mesh."""
         path = self.files[frame_id]
-        if path.suffix != ".npz":
+        if self.arrays is None:
             return read_mesh(path).mesh
-        with ArrayFile(path) as arrays:
-            return Mesh(arrays["vertices"][frame_id].astype(np.float32), arrays["faces"].astype(np.int32))
+        vertices, faces = self.arrays
+        try:
+            return Mesh(vertices[frame_id].astype(np.float32), faces.astype(np.int32))
+        except InputError as error:
+            raise InputError(f"{path}: frame {frame_id}: {error}") from None
 
     def digest(self) -> str:
         return file_digest(set(self.files.values()), root=self.path if self.path.is_dir() else self.path.parent)
@@ -50,10 +55,11 @@ def open_sequence(path: Path) -> MeshSequence:
     """
     if path.is_file() and path.suffix == ".npz":
         with ArrayFile(path) as arrays:
-            shape = arrays["vertices"].shape
+            vertices, faces = arrays["vertices"], arrays["faces"]
+        shape = vertices.shape
         if len(shape) != 3 or shape[2] != 3 or not shape[0]:
             raise InputError(f"{path}: expected vertices of shape (frames, vertices, 3), found {shape}")
-        return MeshSequence(path, dict.fromkeys(range(shape[0]), path))
+        return MeshSequence(path, dict.fromkeys(range(shape[0]), path), (vertices, faces))
     if not path.is_dir():
         found = "a file" if path.exists() else "nothing"
         raise InputError(f"{path}: expected a folder of mesh files or an npz, found {found}")

@@ -125,7 +125,7 @@ def plain_take(config: PlainTakeConfig, body: Body) -> PlainTake:
     scans = {}
     for index, frame_id in enumerate(frame_ids.tolist()):
         surfaces = [
-            Surface(sheet.posed(shirts[index]), sheet.colours, LABEL_GARMENT, fusion.garment_voxel_m),
+            Surface(sheet.posed(shirts[index]), sheet.colours, LABEL_GARMENT, fusion.garment_voxel_m, sheet.painted),
             Surface(
                 Mesh(bodies[index].astype(np.float32), body.template.faces), dress, LABEL_BODY, fusion.body_voxel_m
             ),

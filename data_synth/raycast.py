@@ -29,11 +29,13 @@ class Surface:
 
     mesh: Mesh
     colours: UInt8[np.ndarray, "verts 3"]
-    """sRGB per vertex; a painted border is the colour of its vertices."""
+    """sRGB per vertex."""
     label: int
     """0 body, 1 garment."""
     voxel_m: float
     """Edge of the voxels it is fused in."""
+    painted: Bool[np.ndarray, " verts"] | None = None
+    """The vertices of a garment in the paint along its borders, whatever the colours; None if there is none."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

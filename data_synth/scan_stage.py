@@ -11,6 +11,7 @@ from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 
 from capture4d.errors import InputError
@@ -36,12 +37,15 @@ from capture4d.workdir import Stage, file_digest, open_stage, run_jobs
 from data_synth.border_paint import PaintedSheet, paint_borders
 from data_synth.mesh_sequence import MeshSequence, open_sequence
 from data_synth.rig import bounding_sphere, scanner_rig
+from data_synth.scan_files import pending_scans
 from data_synth.scanner import LABEL_GARMENT, Surface, scan_surfaces
 from data_synth.scanner_config import ScanConfig
+from data_synth.setting_checks import check_scan
 
 __all__ = ["run"]
 
 SCHEMA = 2
+MODEL = "truth/model.npz"
 ROTATIONS = {
     "x": [[0, 1, 0], [1, 0, 0], [0, 0, -1]],
     "y": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
@@ -59,41 +63,50 @@ def run(
     workers: int = 1,
     overwrite: bool = False,
 ) -> str:
-    """Scan every mesh that has no scan yet; the digest of the capture.
+    """Scan every mesh that has no whole scan yet, or has lost its truth; the digest of the capture.
 
     Args:
         meshes: folder of mesh files, or npz with vertices (T, V, 3) and faces (F, 3).
         output: capture folder.
         template: mesh to register later. It lies on the first mesh, or is the same mesh in another pose.
     Raises:
-        InputError: there are no meshes, or one is damaged, or the template has nothing to do with them.
+        InputError: there are no meshes, or one is damaged, or the template has nothing to do with them; or a setting is
+            out of range.
     """
-    _sequence.cache_clear()
+    check_scan(config)
+    colours = [parse_colour(text) for text in config.border_colours]
+    garment_colour = parse_colour(config.garment_colour)
+    for cached in (_sequence, _first, _painted):  # files may have changed since an earlier run in this process
+        cached.cache_clear()
     source = _open_source(meshes, config)
     upstream = {"meshes": _sequence(meshes).digest()}
     if template is not None:
         upstream["template"] = file_digest([template], root=template.parent)
     stage = open_stage(output, name="scan", schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite)
     same_topology = _prepare(stage, source, template)
-    jobs = stage.pending(source.frame_ids, ".ply", folder="scans")
+    pending = set(pending_scans(stage, source.frame_ids))
+    if same_topology:
+        pending.update(stage.pending(source.frame_ids, folder="truth"))
+    jobs = sorted(pending)
     for _ in run_jobs(partial(_scan_frame, stage, source, same_topology), jobs, workers=workers, label="scan"):
         pass
-    colours = [parse_colour(text) for text in config.border_colours]
     garment = source.loop_names if colours and config.border_paint_m > 0 else ()
     write_capture_description(
         Capture(
             path=output,
             name=meshes.stem,
-            fps=config.fps / config.step,
+            fps=config.fps,
             frame_ids=source.frame_ids,
-            garment_colour=parse_colour(config.garment_colour),
+            garment_colour=garment_colour,
             boundary_colours={name: colours[index % len(colours)] for index, name in enumerate(garment)},
         )
     )
-    names = ["capture.json", "rig.json", "template.npz"]
-    frames = [stage.frame_path(frame_id, ".ply", folder="scans") for frame_id in source.frame_ids]
-    truth = sorted((output / "truth").glob("*.npz"))
-    return stage.finish([*(output / name for name in names), *frames, *truth])
+    files = [output / name for name in ("capture.json", "rig.json", "template.npz")]
+    files += [stage.frame_path(frame_id, ".ply", folder="scans") for frame_id in source.frame_ids]
+    if same_topology:
+        files.append(output / MODEL)
+        files += [stage.frame_path(frame_id, folder="truth") for frame_id in source.frame_ids]
+    return stage.finish(files)
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,15 +161,16 @@ def _chosen_frames(sequence: MeshSequence, config: ScanConfig) -> tuple[int, ...
 def _prepare(stage: Stage, source: _Source, template: Path | None) -> bool:
     """Write rig, template and truth model where missing; whether all meshes have the same faces."""
     first = _first(source)
-    model, rig = stage.path / "truth" / "model.npz", stage.path / "rig.json"
-    if not rig.is_file():
+    model, rig, own = stage.path / MODEL, stage.path / "rig.json", stage.path / "template.npz"
+    lost = not model.is_file() and model.parent.is_dir()
+    if lost or not rig.is_file() or not own.is_file():
         same, lower, upper = True, first.vertices.min(axis=0), first.vertices.max(axis=0)
         for frame_id in source.frame_ids[1:]:
             mesh = source.mesh(frame_id)
             same &= mesh.faces.shape == first.faces.shape and bool((mesh.faces == first.faces).all())
             lower, upper = np.minimum(lower, mesh.vertices.min(axis=0)), np.maximum(upper, mesh.vertices.max(axis=0))
         garment, faces, barycentric = _template(source, first, template)
-        save_garment(stage.path / "template.npz", garment)
+        save_garment(own, garment)
         if same:
             loops = dict(zip(source.loop_names, boundary_loops(first.faces), strict=True))
             write_truth_model(model, TruthModel(first, loops, faces, barycentric))
@@ -175,6 +189,10 @@ def _template(source: _Source, first: Mesh, path: Path | None) -> tuple[Garment,
     same_mesh = mesh.faces.shape == first.faces.shape and bool((mesh.faces == first.faces).all())
     if same_mesh and len(mesh.vertices) == len(first.vertices):
         return Garment(mesh, dict(zip(names, boundary_loops(first.faces), strict=True))), *_own_vertices(first)
+    if boundary_loops(mesh.faces) and not names:
+        raise InputError(
+            f"{path}: expected a closed template, as the first mesh of {source.path} is; found one with open borders"
+        )
     points, faces, barycentric = closest_points(first, mesh.vertices)
     distance = np.linalg.norm(points - mesh.vertices, axis=1).mean()
     size = np.ptp(first.vertices, axis=0).max()
@@ -196,12 +214,20 @@ def _own_vertices(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
 
 def _matched_loops(mesh: Mesh, first: Mesh, names: tuple[str, ...]) -> dict[str, np.ndarray]:
     """The template's border loops under the names of the sequence's loops nearest to them."""
+    loops = boundary_loops(mesh.faces)
+    distances = _loop_distances(mesh, first)
+    found: dict[str, np.ndarray] = {}
+    for loop, nearest in zip(loops, distances.argmin(axis=1) if loops else [], strict=True):
+        found.setdefault(names[nearest], loop)
+    return found
+
+
+def _loop_distances(mesh: Mesh, first: Mesh) -> np.ndarray:
+    """Mean distance of each border loop of a mesh, the longest first, to each of the first mesh."""
     trees = [KDTree(first.vertices[loop]) for loop in boundary_loops(first.faces)]
-    loops = {}
-    for loop in boundary_loops(mesh.faces):
-        distances = [tree.query(mesh.vertices[loop])[0].mean() for tree in trees]
-        loops.setdefault(names[int(np.argmin(distances))], loop)
-    return loops
+    loops = boundary_loops(mesh.faces)
+    distances = [tree.query(mesh.vertices[loop])[0].mean() for loop in loops for tree in trees]
+    return np.array(distances).reshape(len(loops), len(trees))
 
 
 def _decimated(mesh: Mesh, vertices: int) -> Mesh:
@@ -217,25 +243,42 @@ def _decimated(mesh: Mesh, vertices: int) -> Mesh:
 
 @cache
 def _painted(source: _Source) -> PaintedSheet:
-    return _paint(_first(source), source.config)
+    return _paint(_first(source), _first(source), source.config)
 
 
-def _paint(mesh: Mesh, config: ScanConfig) -> PaintedSheet:
+def _paint(mesh: Mesh, first: Mesh, config: ScanConfig) -> PaintedSheet:
+    """Paint each border as the one of the first mesh that it is: which is the longest may change with the faces."""
+    colours = [parse_colour(text) for text in config.border_colours]
     return paint_borders(
         mesh,
         width_m=config.border_paint_m,
         garment_colour=parse_colour(config.garment_colour),
-        border_colours=[parse_colour(text) for text in config.border_colours],
+        border_colours=[colours[loop % len(colours)] for loop in _same_loops(mesh, first)] if colours else [],
         max_edge_m=config.scanner.fusion.garment_voxel_m,
     )
+
+
+def _same_loops(mesh: Mesh, first: Mesh) -> list[int]:
+    """The border loop of the first mesh that each loop of a mesh is: one to one the nearest, where the meshes are laid
+    on each other; further loops are those next to them."""
+    middle = mesh.vertices.mean(axis=0) - first.vertices.mean(axis=0)
+    distances = _loop_distances(mesh.with_vertices(mesh.vertices - middle), first)
+    if not distances.size:
+        return list(range(len(distances)))
+    found = distances.argmin(axis=1)
+    rows, columns = linear_sum_assignment(distances)
+    found[rows] = columns
+    return found.tolist()
 
 
 def _scan_frame(stage: Stage, source: _Source, same_topology: bool, frame_id: int) -> None:
     """Scan one mesh; truth first, for the frame counts as done once its scan is there."""
     config = source.config
     mesh = source.mesh(frame_id)
-    sheet = _painted(source) if same_topology else _paint(mesh, config)
-    surface = Surface(sheet.posed(mesh.vertices), sheet.colours, LABEL_GARMENT, config.scanner.fusion.garment_voxel_m)
+    sheet = _painted(source) if same_topology else _paint(mesh, _first(source), config)
+    surface = Surface(
+        sheet.posed(mesh.vertices), sheet.colours, LABEL_GARMENT, config.scanner.fusion.garment_voxel_m, sheet.painted
+    )
     scan, labels = scan_surfaces(
         load_rig(stage.path / "rig.json"),
         [surface],

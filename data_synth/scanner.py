@@ -64,8 +64,9 @@ def scan_surfaces(
     fields = draw_noise_fields(config.noise, rng, largest_image=int(rig.image_sizes.max()))
     sized = [(surface, _area(surface)) for surface in surfaces]
     volumes = [DepthFusion(surface.voxel_m, area, config=config.fusion) for surface, area in sized]
-    insides = [DepthFusion(surface.voxel_m, 0.1 * area, config=config.fusion) for surface, area in sized]
-    sides = [(volumes, 1), (insides, -1)] if config.fusion.inside else [(volumes, 1)]
+    sides = [(volumes, 1)]
+    if config.fusion.inside:
+        sides.append(([DepthFusion(surface.voxel_m, 0.1 * area, config=config.fusion) for surface, area in sized], -1))
     for camera in range(len(rig.names)):
         images = scene.view(rig, camera)
         if images is None:
@@ -144,12 +145,9 @@ def _nearest_labels(surfaces: Sequence[Surface], points: np.ndarray) -> UInt8[np
 
 
 def _labels(surface: Surface, points: np.ndarray) -> UInt8[np.ndarray, " points"]:
-    """Body, garment, or border where the nearest vertex of the garment has another colour than most of it."""
-    if surface.label != LABEL_GARMENT:
+    """Body, garment, or border where the nearest vertex of the garment is painted."""
+    painted = surface.painted
+    if surface.label != LABEL_GARMENT or painted is None or not painted.any() or not len(points):
         return np.full(len(points), surface.label, np.uint8)
-    code = surface.colours.astype(np.int32) @ np.array([1 << 16, 1 << 8, 1], np.int32)
-    painted = code != np.bincount(code).argmax()
-    if not painted.any() or not len(points):
-        return np.full(len(points), LABEL_GARMENT, np.uint8)
     _, nearest = KDTree(surface.mesh.vertices).query(points, workers=1)
     return np.where(painted[nearest], LABEL_BORDER, LABEL_GARMENT).astype(np.uint8)

@@ -74,6 +74,7 @@ def dress(shaped: ShapedBody, mesh: PanelMesh, pattern: Pattern, first: PosedBod
         Vertex positions (V, 3), metres.
     """
     surface = with_pose(shaped, dressing_rotations(shaped), np.zeros(3)).vertices()
+    body = _Surface.create(surface, shaped.body.template.faces)
     names = shaped.body.joint_names
     shoulder = shaped.joints[names.index("upperarm01.L")]
     trunk = surface[(np.abs(surface[:, 0]) < 0.12) & (np.abs(surface[:, 1] - shoulder[1] + 0.15) < 0.25)]
@@ -92,14 +93,14 @@ def dress(shaped: ShapedBody, mesh: PanelMesh, pattern: Pattern, first: PosedBod
         near = np.minimum(seams.query(placed[rows, :2])[0] / PILLOW_M, 1)
         placed[rows, 2] = middle_z + sign * depth * np.sqrt(1 - (1 - near) ** 2)
         # Out of the arms on the panel's own side: sewn to the other side, cloth would have to pass through them.
-        placed[rows] = _push_outside_along(placed[rows], sign, surface, shaped.body.template.faces, clearance=0.008)
+        placed[rows] = _push_outside_along(placed[rows], sign, body, clearance=0.008)
     half = np.abs(draft[panel == "front", 0]).max()
     for side, sign in (("left", 1.0), ("right", -1.0)):
         rows = panel == f"sleeve_{side}"
         arm = surface[(sign * surface[:, 0] > half) & (sign * surface[:, 0] < half + 0.12)]
         placed[rows] = _tube(draft[rows], arm, sign, half)
-    placed = _push_outside(placed, surface, shaped.body.template.faces, clearance=0.008)
-    placed = _push_edges_outside(placed, unique_edges(mesh.faces), surface, shaped.body.template.faces)
+    placed = _push_outside(placed, body, clearance=0.008)
+    placed = _push_edges_outside(placed, unique_edges(mesh.faces), body)
     # Where panels coincide triangles have no area, and newton would leave them out.
     placed += np.random.default_rng(0).normal(scale=2e-4, size=placed.shape)
     root = first.transforms[0]
@@ -120,42 +121,50 @@ def _tube(draft: np.ndarray, arm: np.ndarray, sign: float, start_x: float) -> np
     return np.column_stack([sign * (start_x - v), middle + around])
 
 
-def _heights(points: np.ndarray, surface: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Height over the nearest face, (V,) metres, negative inside; that face's nearest point and normal, (V, 3)."""
-    scene = import_open3d().t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(surface.astype(np.float32), faces.astype(np.uint32))
-    closest = scene.compute_closest_points(points.astype(np.float32))
-    foot, normals = closest["points"].numpy(), closest["primitive_normals"].numpy()
-    return np.einsum("vc,vc->v", points.astype(np.float32) - foot, normals), foot, normals
+@dataclass(frozen=True, slots=True, eq=False)
+class _Surface:
+    """A body that is looked up many times."""
+
+    scene: Any
+
+    @staticmethod
+    def create(vertices: np.ndarray, faces: np.ndarray) -> _Surface:
+        scene = import_open3d().t.geometry.RaycastingScene(nthreads=1)
+        scene.add_triangles(vertices.astype(np.float32), faces.astype(np.uint32))
+        return _Surface(scene)
+
+    def heights(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Height over the nearest face, (V,) metres, negative inside; that face's nearest point and normal, (V, 3)."""
+        closest = self.scene.compute_closest_points(points.astype(np.float32))
+        foot, normals = closest["points"].numpy(), closest["primitive_normals"].numpy()
+        return np.einsum("vc,vc->v", points.astype(np.float32) - foot, normals), foot, normals
 
 
-def _push_outside(points: np.ndarray, surface: np.ndarray, faces: np.ndarray, clearance: float) -> np.ndarray:
+def _push_outside(points: np.ndarray, surface: _Surface, clearance: float) -> np.ndarray:
     """Move every point nearer than `clearance`, or inside, to that distance outside the surface."""
-    heights, foot, normals = _heights(points, surface, faces)
+    heights, foot, normals = surface.heights(points)
     return np.where((heights < clearance)[:, None], foot + clearance * normals, points)
 
 
-def _push_outside_along(
-    points: np.ndarray, sign: float, surface: np.ndarray, faces: np.ndarray, clearance: float
-) -> np.ndarray:
+def _push_outside_along(points: np.ndarray, sign: float, surface: _Surface, clearance: float) -> np.ndarray:
     """Move every point nearer than `clearance`, or inside, along sign * Z until it is outside."""
     points = points.copy()
     for _ in range(200):
-        near = _heights(points, surface, faces)[0] < clearance
+        near = surface.heights(points)[0] < clearance
         if not near.any():
             break
         points[near, 2] += sign * 0.5 * clearance
     return points
 
 
-def _push_edges_outside(points: np.ndarray, edges: np.ndarray, surface: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def _push_edges_outside(points: np.ndarray, edges: np.ndarray, surface: _Surface) -> np.ndarray:
     """Move the ends, (V, 3), of edges, (E, 2), that cut into the surface, until none does or 60 steps are made."""
     shares = np.array([0.25, 0.5, 0.75])[:, None]
     points, low = points.copy(), np.arange(len(edges))
     for _ in range(60):
         start, end = points[edges[low]].transpose(1, 0, 2)
         samples = start[:, None] * (1 - shares) + end[:, None] * shares
-        heights, _, normals = _heights(samples.reshape(-1, 3), surface, faces)
+        heights, _, normals = surface.heights(samples.reshape(-1, 3))
         heights, normals = heights.reshape(-1, 3), normals.reshape(-1, 3, 3)
         rows, deepest = np.arange(len(low)), np.argmin(heights, axis=1)
         inside = heights[rows, deepest] < 0
@@ -305,7 +314,7 @@ def _build_model(mesh: PanelMesh, start: np.ndarray, bodies: Sequence[PosedBody]
     model = builder.finalize(device="cpu")
     model.soft_contact_ke, model.soft_contact_kd, model.soft_contact_mu = 1e4, 1e-3, fabric.friction
     # newton computes the box of a collider once: make it hold the whole motion.
-    joints = np.concatenate([each.transforms[:, :3, 3] + each.shaped.joints for each in bodies])
+    joints = np.concatenate([each.joint_centres() for each in bodies])
     lower, upper = model.shape_collision_aabb_lower, model.shape_collision_aabb_upper
     assert lower is not None
     assert upper is not None

@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from capture4d.body import PosedBody, ShapedBody, pose_frame, with_shape
 from capture4d.body_anny import load_anny
+from capture4d.errors import InputError
 from capture4d.motion_retarget import pose_sequence
 from capture4d.records import load_rig, save_body, save_garment, save_poses, save_rig
 from capture4d.scans import (
@@ -28,14 +30,16 @@ from capture4d.scans import (
     write_truth_model,
 )
 from capture4d.types import Mesh, PoseSequence, Rig
-from capture4d.workdir import Stage, open_stage, run_jobs, write_json, write_npz
+from capture4d.workdir import Stage, file_digest, open_stage, run_jobs, write_json, write_npz
 from data_synth.cloth_quality import measure_cloth
 from data_synth.config import FABRICS, SynthConfig
 from data_synth.motions import make_motion
 from data_synth.outfits import OUTFITS, Outfit
 from data_synth.patterns import PanelMesh, Pattern, grade, locate, mesh_pattern, tshirt_pattern
 from data_synth.rig import bounding_sphere, scanner_rig
+from data_synth.scan_files import pending_scans
 from data_synth.scanner import LABEL_BODY, LABEL_GARMENT, Surface, scan_surfaces
+from data_synth.setting_checks import check_synth
 from data_synth.simulation import approach_poses, dress, simulate
 from data_synth.template import bind_template, carry
 from data_synth.wrinkle_relaxation import WrinkleMesh, relax_frame, wrinkle_mesh
@@ -43,6 +47,7 @@ from data_synth.wrinkle_relaxation import WrinkleMesh, relax_frame, wrinkle_mesh
 __all__ = [
     "Take",
     "finish_take",
+    "is_whole",
     "open_take",
     "prepare_take",
     "run",
@@ -57,6 +62,17 @@ __all__ = [
 ]
 
 SCHEMA = 2
+SIMULATED = (
+    "capture.json",
+    "rig.json",
+    "body.npz",
+    "poses.npz",
+    "template.npz",
+    "truth/poses.npz",
+    "truth/model.npz",
+)
+"""Files of a take that the simulation writes, besides the cloth."""
+QUALITY = "truth/quality.json"
 BORDER_BAND_M = 0.009
 """Width of the painted border."""
 RIG_RADIUS_M = 0.58
@@ -142,7 +158,11 @@ def _person(shape: tuple[float, ...]) -> ShapedBody:
 def run(output: Path, config: SynthConfig, *, workers: int = 2, overwrite: bool = False) -> str:
     """Simulate and scan a take; the digest of the capture folder.
 
-    Simulation is sequential and starts over when it was interrupted; scans are made in parallel and kept.
+    Simulation is sequential and starts over when it was interrupted; scans are made in parallel and kept. Files that a
+    finished take has lost are made anew, for which the clip is simulated again.
+
+    Raises:
+        InputError: a setting is out of range, or the folder holds something else.
     """
     stage = open_take(output, config, overwrite=overwrite)
     for _ in run_jobs(
@@ -160,8 +180,19 @@ def run(output: Path, config: SynthConfig, *, workers: int = 2, overwrite: bool 
 
 
 def open_take(output: Path, config: SynthConfig, *, overwrite: bool = False) -> Stage:
-    """The folder of a take, new or to be continued."""
-    return open_stage(output, name="synth", schema=SCHEMA, config=config, upstream={}, overwrite=overwrite)
+    """The folder of a take, new or to be continued.
+
+    Raises:
+        InputError: a setting is out of range, or the folder holds something else or a take with other settings.
+    """
+    check_synth(config)
+    upstream = {}
+    if config.motion.bvh is not None:
+        path = Path(config.motion.bvh)
+        if not path.is_file():
+            raise InputError(f"{path}: no such BVH file")
+        upstream["bvh"] = file_digest([path], root=path.parent)
+    return open_stage(output, name="synth", schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite)
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,9 +213,13 @@ class ScanJob:
 
 
 def simulation_jobs(stage: Stage, config: SynthConfig) -> list[SimulationJob]:
-    """One, or none if the clip has been simulated."""
-    done = (stage.path / "cloth" / "complete.json").exists() or not _unscanned(stage, config)
-    return [] if done else [SimulationJob(stage, config)]
+    """One, or none if the clip has been simulated. What an interrupted simulation has left is removed."""
+    cloth = stage.path / "cloth"
+    lost = [name for name in SIMULATED if not (stage.path / name).is_file()]
+    if ((cloth / "complete.json").exists() and not lost) or is_whole(stage, config):
+        return []
+    shutil.rmtree(cloth, ignore_errors=True)
+    return [SimulationJob(stage, config)]
 
 
 def simulated_frames(stage: Stage) -> int:
@@ -193,26 +228,35 @@ def simulated_frames(stage: Stage) -> int:
 
 
 def scan_jobs(stage: Stage, config: SynthConfig) -> list[ScanJob]:
-    """The frames that have not been scanned yet."""
+    """The frames that have not been scanned yet, or whose scan or truth is lost or cut off."""
     return [ScanJob(stage, config, frame_id) for frame_id in _unscanned(stage, config)]
 
 
+def is_whole(stage: Stage, config: SynthConfig) -> bool:
+    """Whether every file of the take is there."""
+    wanted = [*SIMULATED, QUALITY]
+    return all((stage.path / name).is_file() for name in wanted) and not _unscanned(stage, config)
+
+
 def _unscanned(stage: Stage, config: SynthConfig) -> list[int]:
-    return stage.pending(range(1, config.frames + 1), folder="truth")
+    frame_ids = range(1, config.frames + 1)
+    pending = set(stage.pending(frame_ids, folder="truth"))
+    if config.scans:
+        pending.update(pending_scans(stage, frame_ids))
+    return sorted(pending)
 
 
 def finish_take(stage: Stage, config: SynthConfig) -> str:
     """Close the folder of a take whose frames are all there; its digest."""
-    _write_quality(stage, list(range(1, config.frames + 1)))
-    files = [path for path in sorted(stage.path.rglob("*")) if path.is_file() and _belongs(stage, path)]
+    frame_ids = list(range(1, config.frames + 1))
+    _write_quality(stage, frame_ids)
+    files = [stage.path / name for name in (*SIMULATED, QUALITY)]
+    files += [stage.frame_path(frame_id, folder="truth") for frame_id in frame_ids]
+    if config.scans:
+        files += [stage.frame_path(frame_id, ".ply", folder="scans") for frame_id in frame_ids]
     digest = stage.finish(files)
     shutil.rmtree(stage.path / "cloth", ignore_errors=True)
     return digest
-
-
-def _belongs(stage: Stage, path: Path) -> bool:
-    relative = path.relative_to(stage.path)
-    return relative.parts[0] != "cloth" and path.name != "stage.json" and not path.name.startswith(".")
 
 
 def simulate_take(take: Take) -> Iterator[tuple[int, np.ndarray, np.ndarray | None]]:
@@ -322,12 +366,11 @@ def _measured_poses(take: Take) -> PoseSequence:
     )
 
 
-def paint_garment(mesh: PanelMesh, outfit: Outfit) -> np.ndarray:
-    """sRGB per vertex, (V, 3) uint8: the garment's colour, and a painted band along every border of the pattern."""
+def painted_band(mesh: PanelMesh) -> np.ndarray:
+    """The vertices, (V,) bool, in the painted band along every border of the pattern."""
     border = np.concatenate(list(mesh.loops.values()))
     corners = np.isin(mesh.faces, border)
-    painted = KDTree(mesh.uv[corners]).query(mesh.vertex_uv, distance_upper_bound=BORDER_BAND_M)[0] < BORDER_BAND_M
-    return np.where(painted[:, None], outfit.border, outfit.garment).astype(np.uint8)
+    return KDTree(mesh.uv[corners]).query(mesh.vertex_uv, distance_upper_bound=BORDER_BAND_M)[0] < BORDER_BAND_M
 
 
 def dress_colours(shaped: ShapedBody, outfit: Outfit) -> np.ndarray:
@@ -345,12 +388,20 @@ def take_rig(config: SynthConfig, extent: np.ndarray) -> Rig:
 
 def take_surfaces(take: Take, fine: np.ndarray, surface: np.ndarray) -> list[Surface]:
     """What the scanner sees of a frame: the painted garment, (V, 3), and the body in its suit, (B, 3); float32."""
-    fusion, outfit = take.config.scanner.fusion, OUTFITS[take.config.outfit]
+    fusion, (cloth, painted, dress) = take.config.scanner.fusion, _colours(take)
     faces = take.shaped.body.template.faces
     return [
-        Surface(Mesh(fine, take.fine.faces), paint_garment(take.fine, outfit), LABEL_GARMENT, fusion.garment_voxel_m),
-        Surface(Mesh(surface, faces), dress_colours(take.shaped, outfit), LABEL_BODY, fusion.body_voxel_m),
+        Surface(Mesh(fine, take.fine.faces), cloth, LABEL_GARMENT, fusion.garment_voxel_m, painted),
+        Surface(Mesh(surface, faces), dress, LABEL_BODY, fusion.body_voxel_m),
     ]
+
+
+@lru_cache(maxsize=1)
+def _colours(take: Take) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of the garment (V, 3), where it is painted (V,), and of the body (B, 3): the same in every frame of a take."""
+    outfit, painted = OUTFITS[take.config.outfit], painted_band(take.fine)
+    cloth = np.where(painted[:, None], outfit.border, outfit.garment).astype(np.uint8)
+    return cloth, painted, dress_colours(take.shaped, outfit)
 
 
 _PREPARED: dict[SynthConfig, tuple[Take, Rig]] = {}
@@ -387,7 +438,7 @@ def scan_frame(job: ScanJob) -> int:
 
 def _write_quality(stage: Stage, frame_ids: list[int]) -> None:
     """Gather the measures of every simulated frame; bad frames are reported, not hidden."""
-    path = stage.path / "truth" / "quality.json"
+    path = stage.path / QUALITY
     if path.exists():
         return
     rows = [

@@ -16,8 +16,10 @@ from pathlib import Path
 
 from capture4d.workdir import Stage, open_stage, run_jobs, write_bytes, write_json
 from data_synth.config import SynthConfig, TrainingSetConfig
+from data_synth.setting_checks import check_synth
 from data_synth.stage import (
     finish_take,
+    is_whole,
     open_take,
     scan_frame,
     scan_jobs,
@@ -32,24 +34,30 @@ SCHEMA = 1
 
 
 def run(output: Path, config: TrainingSetConfig, *, workers: int = 2, overwrite: bool = False) -> str:
-    """Make what is missing of a training set; the digest of all of it."""
+    """Make what is missing of a training set; the digest of all of it.
+
+    Raises:
+        InputError: a setting of a take is out of range, or the folder holds something else.
+    """
+    for take in config.takes.values():
+        check_synth(take)
     stage = open_stage(output, name="training-set", schema=SCHEMA, config=config, upstream={}, overwrite=overwrite)
-    if (output / "set.json").is_file():  # the last file of a run
-        return stage.finish([output / "set.json"])
     wanted = {f"takes/{name}": take for name, take in config.takes.items()}
     wanted |= {
         f"bodies/{who}/{name}": take for who, takes in body_takes(config).items() for name, take in takes.items()
     }
+    folders = {name: replace(stage, path=output / name) for name in wanted}
+    if (output / "set.json").is_file() and all(is_whole(folders[name], take) for name, take in wanted.items()):
+        return stage.finish([output / "set.json"])
     takes = {name: (open_take(output / name, take), take) for name, take in wanted.items()}
-    open_ = {name: each for name, each in takes.items() if not (each[0].path / "truth" / "quality.json").is_file()}
-    simulations = [job for each in open_.values() for job in simulation_jobs(*each)]
+    simulations = [job for each in takes.values() for job in simulation_jobs(*each)]
     simulated = [job.stage for job in simulations]
     for _ in run_jobs(
         simulate_clip, simulations, workers=workers, label="Simulating clips", units=lambda job: job.config.frames,
         finished=lambda: sum(map(simulated_frames, simulated)),
     ):  # fmt: skip
         pass
-    scans = [job for each in open_.values() for job in scan_jobs(*each)]
+    scans = [job for each in takes.values() for job in scan_jobs(*each)]
     for _ in run_jobs(scan_frame, scans, workers=workers, label="Scanning"):
         pass
     digests = {name: _finish(output, config, *each) for name, each in takes.items()}

@@ -48,7 +48,8 @@ def border_targets(
     Args:
         border: template border vertices, metres.
         loops: the loop of each border vertex.
-        scan_loops: the loop of each painted point where the paint tells, else -1; then it votes among all loops.
+        scan_loops: the loop of each painted point where the paint tells, else -1; then it votes among the loops that no
+            point names.
         gate: farthest voter, metres.
     """
     points = border.copy()
@@ -70,10 +71,13 @@ def tangent_free_metric(
 
 
 def _groups(loops: np.ndarray, scan_loops: np.ndarray) -> Sequence[tuple[np.ndarray, np.ndarray]]:
-    """Template border vertices and the painted points that may vote for them."""
-    if (scan_loops < 0).all():
-        return [(np.arange(len(loops)), np.arange(len(scan_loops)))]
-    parts = [(np.flatnonzero(loops == loop), np.flatnonzero(scan_loops == loop)) for loop in np.unique(loops)]
+    """Template border vertices and the painted points that may vote for them.
+
+    Points whose paint does not tell vote among the loops that no point names.
+    """
+    told = np.unique(scan_loops[scan_loops >= 0])
+    parts = [(np.flatnonzero(loops == loop), np.flatnonzero(scan_loops == loop)) for loop in told]
+    parts.append((np.flatnonzero(~np.isin(loops, told)), np.flatnonzero(scan_loops < 0)))
     return [(template, scan) for template, scan in parts if len(template) and len(scan)]
 
 

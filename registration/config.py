@@ -128,6 +128,8 @@ class CoarseConfig:
     them, and where cloth bunches the template's distances push it off its place."""
     compression: float = 0.3
     """Share of the stretch weight that resists shortening, in the warm schedule."""
+    cold_compression: float = 1.0
+    """The same in the cold schedule, where nodes are held to the template's distances."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,8 +194,6 @@ class QualityConfig:
 class RegistrationConfig:
     """Everything the registration stage reads."""
 
-    mode: Literal["default", "paper"] = "default"
-    """default: annealed weights and a dense stage; paper: DeepWrinkles as printed, constant weights, no dense stage."""
     graph: GraphConfig = field(default_factory=GraphConfig)
     solver: LinearSolverConfig = field(default_factory=LinearSolverConfig)
     data: DataConfig = field(default_factory=DataConfig)
@@ -208,7 +208,6 @@ PAPER_SCHEDULE = Schedule(30, (0.12, 0.12), rigid=(500.0, 500.0), smooth=(500.0,
 NO_STEPS = Schedule(0, (0.03, 0.012))
 
 PAPER = RegistrationConfig(
-    mode="paper",
     graph=GraphConfig(nodes=800, vertices=0),
     data=DataConfig(point_share=1.0, smoothing_passes=0),
     boundary=BoundaryConfig(coarse_rule="argmax", dense_rule="argmax", along_curve=False),
@@ -216,6 +215,8 @@ PAPER = RegistrationConfig(
     dense=DenseConfig(cold=NO_STEPS, warm=NO_STEPS),
     sequence=SequenceConfig(start="skinned", carry=0.0),
 )
+
+"""DeepWrinkles as printed: constant weights, no dense stage."""
 
 PRESETS: Mapping[str, RegistrationConfig] = {"default": RegistrationConfig(), "paper": PAPER}
 
@@ -231,6 +232,7 @@ SOFT = RegistrationConfig(
     ),
     coarse=CoarseConfig(
         cold=Schedule(40, (0.3, 0.12), rigid=(0.1, 0.01), smooth=(1000.0, 1.0)),
+        cold_compression=0.5,
     ),
     dense=DenseConfig(
         cold=Schedule(40, (0.12, 0.06), smooth=(30.0, 0.05)),
@@ -248,7 +250,8 @@ class MeshRegistrationConfig:
     boundary_colour: str = ""
     """Paint on the scan's borders, RRGGBB; empty where none is painted."""
     units: Literal["m", "cm", "mm", "auto"] = "auto"
-    """Of both files; decides the millimetres of the report, never the result."""
+    """Of both files; decides the millimetres of the report, never the result. auto: metres if the template's bounding
+    box is less than 8 across, centimetres if less than 200, else millimetres."""
     align: Literal["none", "rigid", "similarity"] = "none"
     """Move the template onto the scan first, with scale for similarity; none if the two already lie on each other."""
     registration: RegistrationConfig = SOFT

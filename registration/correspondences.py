@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64, Int, Integer
+from jaxtyping import Float, Float64, Integer
 from scipy import sparse
 from scipy.spatial import KDTree
 
@@ -34,8 +34,6 @@ class ScanSurface:
     """Smoothed vertices, metres."""
     normals: Float64[np.ndarray, "points 3"]
     """Unit normals."""
-    rim: Bool[np.ndarray, " points"]
-    """True on open edges: borders and the rims of holes."""
     grid: PointGrid
     spacing: float
     """Mean edge length, metres: what the scan resolves."""
@@ -49,10 +47,6 @@ class Matches:
     normals: Float64[np.ndarray, "queries 3"]
     weights: Float64[np.ndarray, " queries"]
     """0 where the gates reject the match."""
-    distances: Float64[np.ndarray, " queries"]
-    """To the nearest scan vertex, metres; infinite beyond the gate."""
-    indices: Int[np.ndarray, " queries"]
-    """Matched scan vertex; the number of scan vertices beyond the gate."""
 
 
 def prepare_scan(
@@ -71,9 +65,9 @@ def prepare_scan(
     normals = vertex_normals_kernel(positions, triangles)
     spacing = float(mean_edge_length(positions, triangles))
     if not used.all():
-        positions, normals, rim = positions[used], normals[used], rim[used]
+        positions, normals = positions[used], normals[used]
     grid = PointGrid.build(positions, CELL_SPACINGS * spacing)
-    return ScanSurface(positions, normals, rim, grid, spacing)
+    return ScanSurface(positions, normals, grid, spacing)
 
 
 def mesh_normals(
@@ -112,13 +106,13 @@ def match(
     )
     better = np.isfinite(further)
     changed = turned[better]
-    nearest[changed], distances[changed] = others[better], further[better]
+    nearest[changed] = others[better]
     cosine[changed] = np.einsum("va,va->v", normals[changed], surface.normals[nearest[changed]])
     target, target_normal = surface.points[nearest], surface.normals[nearest]
     off_plane = np.einsum("va,va->v", points - target, target_normal)
     weights = 1.0 / (1.0 + (off_plane / (robust_scale * gate)) ** 2) ** 2
     weights[~found | (cosine < min_normal_cosine)] = 0.0
-    return Matches(target, target_normal, weights, distances, np.where(found, nearest, len(surface.points)))
+    return Matches(target, target_normal, weights)
 
 
 def match_both_ways(
@@ -162,7 +156,7 @@ def match_both_ways(
     away = np.linalg.norm(points - target, axis=1)
     weights = 1.0 / (1.0 + (away / (robust_scale * gate)) ** 2) ** 2
     weights[(away > gate) | (np.einsum("va,va->v", normals, normal) < min_normal_cosine)] = 0.0
-    return Matches(target, normal, weights, away, voters[np.asarray(pull)[:, 0]])
+    return Matches(target, normal, weights)
 
 
 def _affinity(distance: np.ndarray) -> np.ndarray:

@@ -20,7 +20,7 @@ from registration.deformation_graph import identity_nodes, node_edge_rows, rows_
 from registration.energies import edge_vectors, plane_metric, rigid_term, stretch_metric, tangential_metric
 from registration.fold_lengths import folded_lengths
 from registration.solver import Rows, RowTerm, gauss_newton_step
-from registration.template import TemplateAnalysis
+from registration.template import TemplateAnalysis, require_borders
 
 __all__ = ["FrameRegistration", "FrameScan", "prepare_frame", "register_frame"]
 
@@ -48,20 +48,23 @@ class FrameRegistration:
 
 
 def prepare_frame(analysis: TemplateAnalysis, scan: GarmentScan, config: RegistrationConfig) -> FrameScan:
-    """Smooth the scan, take its normals, build the tree, thin its border points.
+    """Smooth the scan, take its normals, sort its points into cells, thin its border points.
 
     Raises:
+        UnknownBorderError: a paint is named after a loop that the template lacks.
         InputError: the garment scan is empty.
     """
     if not len(scan.mesh.faces):
         raise InputError(f"frame {scan.frame_id}: expected a garment scan with faces, found none")
     surface = prepare_scan(scan.mesh.vertices, scan.mesh.faces, smoothing_passes=config.data.smoothing_passes)
+    told = np.unique(scan.boundary_loops[scan.boundary_loops >= 0])
+    require_borders(analysis.border, [scan.loop_names[loop] for loop in told])
     stride = max(1, -(-len(scan.boundary_points) // config.boundary.max_points))
     names = {name: index for index, name in enumerate(analysis.border.names)}
-    renumbered = np.array([names.get(name, -2) for name in scan.loop_names] + [-1], np.int32)
+    renumbered = np.array([names.get(name, -1) for name in scan.loop_names] + [-1], np.int32)
     loops = renumbered[scan.boundary_loops[::stride]]
     points = scan.boundary_points[::stride].astype(np.float64)
-    return FrameScan(surface, points[loops > -2], loops[loops > -2], scan.frame_id)
+    return FrameScan(surface, points, loops, scan.frame_id)
 
 
 def register_frame(
@@ -124,7 +127,7 @@ def _coarse_stage(
     pair_start = edge_vectors(start[graph.nodes], pairs)
     measured = start if near and config.coarse.start_lengths else analysis.rest
     pair_lengths = np.linalg.norm(edge_vectors(measured[graph.nodes], pairs), axis=1)
-    compression = config.coarse.compression if near else config.dense.compression
+    compression = config.coarse.compression if near else config.coarse.cold_compression
     iterations = 0
     vertices = start
     for step in range(schedule.steps):

@@ -18,7 +18,7 @@ from jaxtyping import Float32, Float64
 from capture4d.errors import InputError
 from capture4d.garment_extraction import painted_border
 from capture4d.mesh import boundary_loops, submesh
-from capture4d.mesh_files import read_mesh, write_mesh
+from capture4d.mesh_files import MESH_SUFFIXES, read_mesh, write_mesh
 from capture4d.scans import parse_colour
 from capture4d.types import Garment, GarmentScan, Mesh
 from capture4d.workdir import write_json
@@ -32,6 +32,8 @@ __all__ = ["MeshRegistration", "register_mesh", "run"]
 
 DIAGONAL = 1.2
 """Diagonal of the template's bounding box while it is registered, metres: a shirt's."""
+CM_BELOW = 200.0
+"""Diagonals from 8 to here are taken for centimetres: a shirt's is 90 to 140 cm, and a hand's 200 mm."""
 METRES: Mapping[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 
@@ -44,7 +46,7 @@ class MeshRegistration:
     start: Float64[np.ndarray, "verts 3"]
     """The template after pre-alignment, in the files' unit."""
     quality: FrameQuality
-    """Of the normalised problem; `numbers` in millimetres of the files' world."""
+    """Judged on the normalised problem; all its lengths, those in `reasons` too, are of the files' world."""
 
 
 def run(template_path: Path, scan_path: Path, output_path: Path, config: MeshRegistrationConfig) -> MeshRegistration:
@@ -53,10 +55,14 @@ def run(template_path: Path, scan_path: Path, output_path: Path, config: MeshReg
     Args:
         output_path: .ply, .obj or .glb; the JSON has the same name.
     Raises:
-        InputError: a file is missing, damaged or empty, the colour is not in the scan, or the sizes cannot belong to
-            one unit.
+        InputError: the output is no mesh file, an input is missing, damaged or empty, the colour is not in the scan, or
+            the sizes cannot belong to one unit.
     """
     begin = time.process_time()
+    if output_path.suffix.lower() not in MESH_SUFFIXES:
+        raise InputError(
+            f"{output_path}: expected a mesh file ({', '.join(MESH_SUFFIXES)}), found '{output_path.suffix}'"
+        )
     template_file, scan_file = read_mesh(template_path), read_mesh(scan_path)
     result = register_mesh(
         template_file.mesh,
@@ -121,25 +127,19 @@ def register_mesh(
     analysis = analyse_template(garment, config.registration)
     frame = prepare_frame(analysis, garment_scan, config.registration)
     fitted = register_frame(analysis, frame, start, config=config.registration, schedule="cold")
-    quality = assess(analysis, frame, fitted.vertices, config.registration.quality)
     metres = METRES[config.units if config.units != "auto" else guess_units(template)]
+    quality = assess(analysis, frame, fitted.vertices, config.registration.quality, length_factor=metres / scale)
     return MeshRegistration(
         vertices=(fitted.vertices / scale + origin).astype(np.float32),
         start=start / scale + origin,
-        quality=_in_units(quality, metres / scale),
+        quality=quality,
     )
 
 
 def guess_units(mesh: Mesh) -> str:
-    """m, cm or mm, from a size between a hand and a house."""
+    """m, cm or mm, from the diagonal of the bounding box, for things between a hand and a garment."""
     size = _diagonal(mesh.vertices)
-    return "m" if size < 8.0 else "cm" if size < 80.0 else "mm"
-
-
-def _in_units(quality: FrameQuality, factor: float) -> FrameQuality:
-    """Lengths of the normalised problem in those of the files' world."""
-    numbers = {key: value * factor if key.endswith("_mm") else value for key, value in quality.numbers.items()}
-    return FrameQuality(quality.verdict, quality.reasons, quality.residual_m * factor, numbers)
+    return "m" if size < 8.0 else "cm" if size < CM_BELOW else "mm"
 
 
 def _diagonal(vertices: np.ndarray) -> float:

@@ -20,7 +20,7 @@ the one before, and the first from the template as it lies.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
@@ -34,7 +34,7 @@ from capture4d.types import Body, GarmentScan, PoseSequence
 from registration.config import RegistrationConfig, SequenceConfig
 from registration.quality import FrameQuality, assess
 from registration.register import FrameScan, prepare_frame, register_frame
-from registration.template import TemplateAnalysis
+from registration.template import TemplateAnalysis, UnknownBorderError
 
 __all__ = ["FrameResult", "Mover", "register_run", "segments"]
 
@@ -145,6 +145,8 @@ def register_run(
         frame_ids: of the whole take.
         load: the garment scan of a frame; may raise InputError, which flags the frame.
         done: vertices of a frame that was finished earlier and whether they may be built upon, or None.
+    Raises:
+        UnknownBorderError: paints are named after loops that the template lacks.
     """
     before: tuple[np.ndarray, int] | None = None
     for position in positions:
@@ -176,9 +178,16 @@ def _register_one(
         scan = prepare_frame(analysis, load(frame_id), config)
         name, start, schedule = _choose(analysis, scan, candidates, before is None, config)
         fitted = register_frame(analysis, scan, start, config=config, schedule=schedule)
+    except UnknownBorderError:  # every frame would fail alike
+        raise
     except InputError as error:
         return FrameResult(
-            frame_id, start.astype(np.float32), _failure(len(start), str(error)), name, 0, time.process_time() - begin
+            frame_id,
+            start.astype(np.float32),
+            FrameQuality.unmeasured(len(start), str(error)),
+            name,
+            0,
+            time.process_time() - begin,
         )
     vertices = fitted.vertices.astype(np.float32)
     quality = assess(analysis, scan, vertices.astype(np.float64), config.quality)
@@ -209,7 +218,7 @@ def _predictions(
 def _choose(
     analysis: TemplateAnalysis,
     scan: FrameScan,
-    candidates: dict[str, np.ndarray],
+    candidates: Mapping[str, np.ndarray],
     distant: bool,
     config: RegistrationConfig,
 ) -> tuple[str, np.ndarray, Literal["cold", "warm"]]:
@@ -218,7 +227,9 @@ def _choose(
     misfits = {name: _distances(scan, vertices[subset]) for name, vertices in candidates.items()}
     if "carried" in candidates and "previous" in candidates:
         share = _share_of_carried(analysis, misfits["carried"], misfits["previous"])[:, None]
-        candidates["blended"] = share * candidates.pop("carried") + (1.0 - share) * candidates.pop("previous")
+        blended = share * candidates["carried"] + (1.0 - share) * candidates["previous"]
+        others = {name: vertices for name, vertices in candidates.items() if name not in ("carried", "previous")}
+        candidates = {**others, "blended": blended}
         misfits["blended"] = _distances(scan, candidates["blended"][subset])
     median = {name: float(np.median(misfits[name])) for name in candidates}
     name = min(median, key=lambda key: median[key])
@@ -246,7 +257,3 @@ def _share_of_carried(analysis: TemplateAnalysis, carried: np.ndarray, previous:
         squares.append(total)
     share = squares[1] / np.maximum(squares[0] + squares[1], 1e-30)
     return np.einsum("vk,vk->v", weights, share[nodes])
-
-
-def _failure(count: int, reason: str) -> FrameQuality:
-    return FrameQuality("failed", (reason,), np.full(count, np.nan), {})

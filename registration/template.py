@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +16,7 @@ from registration.deformation_graph import DeformationGraph, build_graph
 from registration.fold_lengths import edge_faces
 from registration.solver import Rows
 
-__all__ = ["Border", "TemplateAnalysis", "analyse_template"]
+__all__ = ["Border", "TemplateAnalysis", "UnknownBorderError", "analyse_template", "require_borders"]
 
 
 PATTERN_RATIO = (0.7, 1.4)
@@ -97,6 +98,24 @@ def analyse_template(garment: Garment, config: RegistrationConfig) -> TemplateAn
         fan_faces=(np.argsort(faces.reshape(-1), kind="stable") // 3).astype(np.int32),
         laplacian_rows=_laplacian_rows(edges, faces, len(rest)),
     )
+
+
+class UnknownBorderError(InputError):
+    """Paints are named after loops that the template lacks: no frame of the take can be registered."""
+
+
+def require_borders(border: Border, painted: Iterable[str]) -> None:
+    """See that the template has every loop that a paint is named after.
+
+    Raises:
+        UnknownBorderError: it has not; the message names both lists.
+    """
+    missing = sorted(set(painted) - set(border.names))
+    if missing:
+        found = f"those named {', '.join(border.names)}" if border.names else "none"
+        raise UnknownBorderError(
+            f"template: expected border loops named {', '.join(missing)}, as the paints are; found {found}"
+        )
 
 
 def rest_lengths(template: Mesh, edges: Int32[np.ndarray, "edges 2"]) -> Float64[np.ndarray, " edges"]:

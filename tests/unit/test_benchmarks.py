@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.__main__ import main
+from benchmarks.__main__ import baseline_name, main
 from benchmarks.metric import Metric, broken_limits
 
 
@@ -23,6 +23,23 @@ def test_the_list_names_every_benchmark_and_each_has_quick_figures_to_hold(capsy
 def test_an_unknown_benchmark_is_a_usage_error(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["nonsense"]) == 2
     assert "NAME is one of" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "entry"),
+    [
+        ([], "case"),
+        (["--quick"], "case-quick"),
+        (["--data", "diffcloth"], "case-diffcloth"),
+        (["--data=diffcloth", "--quick"], "case-diffcloth-quick"),
+        (["--quick", "--data", "synth"], "case-quick"),
+    ],
+)
+def test_other_data_is_held_to_figures_of_its_own(options: list[str], entry: str) -> None:
+    def run(*, quick: bool = False, data: str = "synth") -> list[Metric]:
+        return []
+
+    assert baseline_name("case", run, options) == entry
 
 
 @pytest.mark.parametrize(

@@ -90,13 +90,13 @@ def test_a_near_miss_gets_a_hint(capsys: pytest.CaptureFixture[str]):
 
 def test_a_preset_is_what_single_options_start_from(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     import registration.stage
-    from registration.config import PAPER, GraphConfig
+    from registration.config import PAPER, GraphConfig, RegistrationConfig
 
     seen = []
     monkeypatch.setattr(registration.stage, "run", lambda *args, **options: seen.append(args[3]))
     for options in ([], ["--preset", "paper"], ["--preset=paper", "--graph.nodes", "99"]):
         run("register", "capture", "--output", tmp_path, *options)
-    assert seen[0].mode == "default"
+    assert seen[0] == RegistrationConfig()
     assert seen[1] == PAPER
     assert seen[2] == replace(PAPER, graph=GraphConfig(nodes=99, vertices=0))
 

@@ -1,4 +1,5 @@
 import dataclasses
+import shutil
 
 import numpy as np
 import pytest
@@ -17,9 +18,10 @@ from capture4d.scans import (
     read_truth_model,
 )
 from capture4d.types import Mesh
+from capture4d.workdir import read_json
 from data_synth.border_paint import paint_borders
 from data_synth.mesh_sequence import open_sequence
-from data_synth.scan_stage import run
+from data_synth.scan_stage import _paint, run
 from data_synth.scanner_config import FusionConfig, RigConfig, ScanConfig, ScannerConfig, StereoConfig
 
 BLUE, YELLOW, RED = (47, 98, 201), (255, 210, 0), (229, 51, 42)
@@ -130,6 +132,92 @@ def test_z_up_npz_sequences(tmp_path):
     run(tmp_path / "sequence.npz", tmp_path / "out", dataclasses.replace(SMALL, up="z", frames=1))
     model = read_truth_model(read_capture(tmp_path / "out"))
     np.testing.assert_allclose(model.fine.vertices, 0.05 * mesh.vertices, atol=1e-6)
+
+
+def test_every_nth_mesh_keeps_its_time(sequence, tmp_path):
+    run(sequence, tmp_path / "out", dataclasses.replace(SMALL, step=2, fps=50.0))
+    description = read_capture(tmp_path / "out")
+    assert description.frame_ids == (5, 25)
+    assert read_scan(description, 25).time_s == pytest.approx(20 / 50)
+
+
+def test_what_is_lost_is_made_again(sequence, capture, tmp_path):
+    digest = read_json(capture / "stage.json")["digest"]
+    again = tmp_path / "again"
+    shutil.copytree(capture, again)
+    scan, truth = again / "scans" / "000015.ply", again / "truth" / "000005.npz"
+    scan.write_bytes(scan.read_bytes()[:-100])
+    truth.unlink()
+    assert run(sequence, again, SMALL) == digest
+    (again / "truth" / "model.npz").unlink()
+    assert run(sequence, again, SMALL) == digest
+
+
+def test_borders_keep_their_paint_when_the_faces_change():
+    """Loops are ordered by their vertices; in the second mesh the other loop is cut finer and comes first."""
+    first = skirt()
+    second_loop = boundary_loops(first.faces)[1]
+    middles = (first.vertices[second_loop] + first.vertices[np.roll(second_loop, -1)]) / 2
+    finer = split_border(first, second_loop, middles)
+    moved = finer.with_vertices(finer.vertices + np.float32(0.5))
+    scanner = ScannerConfig(fusion=FusionConfig(garment_voxel_m=0.2))
+    config = ScanConfig(border_paint_m=0.5, border_colours=("#ffd200", "#e5332a"), scanner=scanner)
+    for mesh in (first, moved):
+        sheet = _paint(mesh, first, config)
+        height = sheet.posed(mesh.vertices).vertices[:, 1] - mesh.vertices[:, 1].min()
+        yellow = height[(sheet.colours == YELLOW).all(axis=1)]
+        red = height[(sheet.colours == RED).all(axis=1)]
+        if mesh is first:
+            low_is_yellow = yellow.max() < 3
+        assert (yellow.max() < 3) == low_is_yellow
+        assert (red.min() > 3) == low_is_yellow
+    assert len(boundary_loops(moved.faces)[0]) == 48, "the first loop is another one now"
+
+
+def split_border(mesh, loop, middles):
+    """The mesh with every edge of a border loop cut in two."""
+    after = dict(zip(loop.tolist(), np.roll(loop, -1).tolist(), strict=True))
+    number = {vertex: len(mesh.vertices) + index for index, vertex in enumerate(loop.tolist())}
+    faces = []
+    for face in mesh.faces.tolist():
+        for corner in range(3):
+            a, b, c = face[corner], face[(corner + 1) % 3], face[(corner + 2) % 3]
+            cut = number[a] if after.get(a) == b else number[b] if after.get(b) == a else None
+            if cut is not None:
+                faces += [(a, cut, c), (cut, b, c)]
+                break
+        else:
+            faces.append(tuple(face))
+    return Mesh(np.concatenate([mesh.vertices, middles]).astype(np.float32), np.array(faces, np.int32))
+
+
+def test_an_npz_is_unpacked_once(tmp_path, monkeypatch):
+    mesh = skirt()
+    np.savez(tmp_path / "sequence.npz", vertices=np.stack([mesh.vertices] * 3), faces=mesh.faces)
+    sequence = open_sequence(tmp_path / "sequence.npz")
+    monkeypatch.setattr(np, "load", None)
+    for frame_id in sequence.frame_ids:
+        np.testing.assert_array_equal(sequence.read(frame_id).vertices, mesh.vertices)
+
+
+def test_meshes_that_have_changed_are_read_again(tmp_path):
+    """Within one process, as a notebook runs it."""
+    one = dataclasses.replace(SMALL, frames=1)
+    write_mesh(tmp_path / "in" / "a1.ply", skirt())
+    run(tmp_path / "in", tmp_path / "out", one)
+    write_mesh(tmp_path / "in" / "a1.ply", skirt(0.5))
+    run(tmp_path / "in", tmp_path / "out", one, overwrite=True)
+    model = read_truth_model(read_capture(tmp_path / "out"))
+    np.testing.assert_allclose(model.fine.vertices, 0.05 * skirt(0.5).vertices, atol=1e-6)
+
+
+def test_an_open_template_does_not_fit_closed_meshes(tmp_path):
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
+    faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], np.int32)
+    write_mesh(tmp_path / "in" / "a1.ply", Mesh(corners, faces))
+    write_mesh(tmp_path / "open.ply", Mesh(corners, faces[:3]))
+    with pytest.raises(InputError, match=r"open\.ply: expected a closed template"):
+        run(tmp_path / "in", tmp_path / "out", SMALL, template=tmp_path / "open.ply")
 
 
 def test_bad_sequences_are_named(tmp_path):

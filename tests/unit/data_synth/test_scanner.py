@@ -108,14 +108,15 @@ def test_an_open_sheet_is_scanned_on_both_sides_without_interference():
     assert np.quantile(np.abs(error[~outward]), 0.95) < 0.25 * 0.004
 
 
-def test_the_painted_border_is_crisp_and_labelled():
+@pytest.mark.parametrize("edge", [0.105, 0.03], ids=["a band", "most of the cloth"])
+def test_the_painted_border_is_crisp_and_labelled(edge):
     mesh = tube(0.24, along=120)
-    border = np.abs(mesh.vertices[:, 1]) > 0.105
+    border = np.abs(mesh.vertices[:, 1]) > edge
     colours = np.where(border[:, None], (255, 210, 0), (47, 98, 201)).astype(np.uint8)
     config = dataclasses.replace(PERFECT, shading=ShadingConfig())
-    result, labels = scan([Surface(mesh, colours, LABEL_GARMENT, 0.004)], config)
-    truly_border = np.abs(result.mesh.vertices[:, 1]) > 0.105
-    sure = np.abs(np.abs(result.mesh.vertices[:, 1]) - 0.105) > 0.004
+    result, labels = scan([Surface(mesh, colours, LABEL_GARMENT, 0.004, border)], config)
+    truly_border = np.abs(result.mesh.vertices[:, 1]) > edge
+    sure = np.abs(np.abs(result.mesh.vertices[:, 1]) - edge) > 0.004
     assert ((labels == LABEL_BORDER) == truly_border)[sure].all()
     yellow = result.colours[:, 0] > result.colours[:, 2]
     assert (yellow == truly_border)[sure].mean() > 0.999

@@ -75,3 +75,9 @@ def test_takes_share_a_template_and_other_people_wear_the_same_triangles(
     (captured / "truth" / "000002.npz").unlink()
     (captured / "truth" / "quality.json").unlink()
     assert run(tmp_path, small, workers=1) == digest
+
+    # a finished set that has lost a scan makes it again
+    scan = captured / "scans" / "000001.ply"
+    scan.unlink()
+    assert run(tmp_path, small, workers=1) == digest
+    assert scan.is_file()

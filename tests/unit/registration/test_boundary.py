@@ -42,6 +42,21 @@ def test_loops_keep_to_themselves_where_the_paint_tells() -> None:
 
 
 @pytest.mark.parametrize("rule", ["argmax", "mean", "nearest"])
+def test_loops_that_share_a_paint_have_targets_beside_one_that_has_its_own(rule) -> None:
+    """Loop 1 has a paint of its own; loops 0 and 2 share one, so its points vote for both and not for loop 1."""
+    loops = np.array([0, 1, 2], np.int32)
+    scan = np.array([[9.0, 1, 0], [8, 0, 0], [11, 0, 0], [21, 0, 0]])
+    scan_loops = np.array([1, -1, -1, -1], np.int32)
+    found = border_targets(TEMPLATE, loops, scan, scan_loops, rule=rule, gate=100.0)
+    assert found.valid.all()
+    expected = {"argmax": [1, 0, 2], "nearest": [1, 0, 3]}
+    if rule == "mean":
+        np.testing.assert_allclose(found.points, [scan[1], scan[0], (scan[2] + scan[3]) / 2])
+    else:
+        np.testing.assert_array_equal(found.points, scan[expected[rule]])
+
+
+@pytest.mark.parametrize("rule", ["argmax", "mean", "nearest"])
 def test_the_gate_holds(rule) -> None:
     found = border_targets(TEMPLATE, ONE_LOOP, SCAN + np.array([0, 50, 0]), NO_LOOPS, rule=rule, gate=10.0)
     assert not found.valid.any()

@@ -27,7 +27,7 @@ def _corrugated(amplitude: float, wavelength: float, extent: float, tilt: np.nda
     normals = np.column_stack([-amplitude * k * np.cos(k * x), np.zeros(len(x)), np.ones(len(x))])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     points = np.column_stack([x, y, amplitude * np.sin(k * x)]) @ tilt.T
-    return ScanSurface(points, normals @ tilt.T, np.zeros(len(x), bool), PointGrid.build(points, 0.003), 0.001)
+    return ScanSurface(points, normals @ tilt.T, PointGrid.build(points, 0.003), 0.001)
 
 
 @pytest.mark.parametrize("amplitude", [0.0, 0.0005, 0.001])

@@ -33,3 +33,28 @@ def test_a_stray_point_costs_no_memory() -> None:
     grid = PointGrid.build(points, 1e-3)
     assert len(grid.starts) <= point_grid.MAX_CELLS + 1
     assert (grid.query(points)[1] == np.arange(101)).all()
+
+
+@pytest.mark.parametrize("cell", [0.01, 0.1, 0.5])
+@pytest.mark.parametrize("min_cosine", [-0.5, 0.4, 0.95])
+def test_the_nearest_that_faces_a_way_is_that_of_brute_force(cell: float, min_cosine: float) -> None:
+    rng = np.random.default_rng(3)
+    points, normals = rng.uniform(size=(400, 3)), rng.normal(size=(400, 3))
+    queries, directions = rng.uniform(-0.3, 1.3, (200, 3)), rng.normal(size=(200, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    bounds = rng.uniform(0.01, 0.5, 200)
+    distance, index = PointGrid.build(points, cell).query_facing(queries, directions, bounds, normals, min_cosine)
+    nothing = 0
+    for query in range(200):
+        away = np.linalg.norm(points - queries[query], axis=1)
+        away[(normals @ directions[query] < min_cosine) | (away >= bounds[query])] = np.inf
+        best = int(np.argmin(away))
+        if np.isfinite(away[best]):
+            assert index[query] == best
+            assert distance[query] == pytest.approx(away[best], abs=1e-12)
+        else:
+            nothing += 1
+            assert index[query] == len(points)
+            assert np.isinf(distance[query])
+    assert 0 < nothing < 200

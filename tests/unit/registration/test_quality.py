@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from registration.config import QualityConfig
-from registration.quality import assess, border_distances, count_intersecting_faces
+from registration.quality import FrameQuality, assess, border_distances, count_intersecting_faces
 from registration.register import prepare_frame
 from registration.template import analyse_template
 
@@ -35,6 +35,56 @@ def test_an_offset_is_measured_and_named(garment, scan_of, config) -> None:
     assert quality.verdict == "failed"
     assert any(reason.startswith("fit_mean_mm") for reason in quality.reasons)
     assert 5 < quality.numbers["fit_mean_mm"] < 10
+
+
+def test_every_measure_is_told_where_it_is(garment, scan_of, config) -> None:
+    """Half of the hem is off its paint, one row of edges is stretched, one vertex is pushed through the cloth."""
+    analysis = analyse_template(garment, config)
+    scan = scan_of(straight_through)
+    frame = prepare_frame(analysis, scan, config)
+    hem, neck = garment.loops["hem"], garment.loops["neck"]
+    moved = analysis.rest.copy()
+    moved[neck, 1] += 0.006
+    quality = assess(analysis, frame, moved, QualityConfig())
+    border = np.zeros(len(moved), bool)
+    border[np.concatenate([hem, neck])] = True
+    assert (np.isfinite(quality.border_error_m) == border).all()
+    np.testing.assert_allclose(quality.border_error_m[neck], 0.006, atol=1.5e-3)
+    assert quality.border_error_m[hem].max() < 0.004
+    away = analysis.rest[:, 1] < 0.45
+    np.testing.assert_allclose(quality.stretch[away], 1.0)
+    for vertex in (int(neck[0]), int(hem[0])):
+        lengths = [
+            np.linalg.norm(moved[a] - moved[b]) / rest
+            for (a, b), rest in zip(analysis.edges, analysis.rest_lengths, strict=True)
+            if vertex in (a, b)
+        ]
+        assert quality.stretch[vertex] == np.mean(lengths)
+    assert not quality.flipped.any()
+    turned = replace(scan, mesh=replace(scan.mesh, faces=scan.mesh.faces[:, ::-1].copy()))
+    assert assess(analysis, prepare_frame(analysis, turned, config), analysis.rest, QualityConfig()).flipped.all()
+
+
+def test_borders_without_paint_have_no_error(garment, scan_of, config) -> None:
+    scan = scan_of(straight_through)
+    seen = scan.boundary_loops == 0
+    hem_only = replace(scan, boundary_points=scan.boundary_points[seen], boundary_loops=scan.boundary_loops[seen])
+    analysis = analyse_template(garment, config)
+    quality = assess(analysis, prepare_frame(analysis, hem_only, config), analysis.rest, QualityConfig())
+    assert np.isfinite(quality.border_error_m[garment.loops["hem"]]).all()
+    assert np.isnan(quality.border_error_m[garment.loops["neck"]]).all()
+
+
+def test_arrays_are_stored_small_and_by_name(garment, scan_of, config) -> None:
+    analysis = analyse_template(garment, config)
+    quality = assess(
+        analysis, prepare_frame(analysis, scan_of(straight_through), config), analysis.rest, QualityConfig()
+    )
+    for arrays in (quality.vertex_arrays(), FrameQuality.unmeasured(len(analysis.rest), "no scan").vertex_arrays()):
+        assert {name: array.dtype.name for name, array in arrays.items()} == {
+            "residual_m": "float32", "border_error_m": "float32", "stretch": "float32", "flipped": "bool",
+        }  # fmt: skip
+        assert {len(array) for array in arrays.values()} == {len(analysis.rest)}
 
 
 def test_holes_have_no_residual(garment, scan_of, config) -> None:

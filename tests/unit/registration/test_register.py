@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 from capture4d.errors import InputError
 from capture4d.mesh import unique_edges
 from capture4d.types import Garment, GarmentScan, Mesh
-from registration.config import LinearSolverConfig
+from registration.config import PAPER, GraphConfig, LinearSolverConfig, RegistrationConfig
 from registration.register import prepare_frame, register_frame
-from registration.template import analyse_template
+from registration.template import UnknownBorderError, analyse_template
 
 
 def bend(points: np.ndarray) -> np.ndarray:
@@ -131,3 +131,51 @@ def test_repeating_gives_the_same_bits(garment, scan_of, config) -> None:
     scan, start = scan_of(bend, noise=3e-4), garment.template.vertices.astype(float)
     first, second = (fit(garment, scan, start, config).vertices for _ in range(2))
     np.testing.assert_array_equal(first, second)
+
+
+def test_paints_named_after_loops_that_the_template_lacks_are_refused(garment, scan_of, config) -> None:
+    scan = replace(scan_of(bend), loop_names=("waist", "neck"))
+    analysis = analyse_template(garment, config)
+    with pytest.raises(UnknownBorderError, match=r"expected border loops named waist.*found those named hem, neck"):
+        prepare_frame(analysis, scan, config)
+    shared = replace(scan, boundary_loops=np.full_like(scan.boundary_loops, -1))
+    assert len(prepare_frame(analysis, shared, config).border_points), "a shared paint names no loop"
+
+
+def test_the_warm_schedule_follows_a_small_motion_and_keeps_its_lengths(garment, scan_of, config) -> None:
+    start = garment.template.vertices.astype(float)
+
+    def lean(points: np.ndarray) -> np.ndarray:
+        return points + np.column_stack([0.02 * points[:, 1] ** 2, 0 * points[:, 0], 0.004 + 0 * points[:, 0]])
+
+    cold, warm = (fit(garment, scan_of(lean), start, config, schedule) for schedule in ("cold", "warm"))
+    assert warm.schedule == "warm"
+    assert warm.linear_iterations < cold.linear_iterations
+    assert np.linalg.norm(warm.vertices - lean(start), axis=1).mean() < 0.002
+    edges = unique_edges(garment.template.faces)
+    lengths = [np.linalg.norm(v[edges[:, 0]] - v[edges[:, 1]], axis=1) for v in (warm.vertices, lean(start))]
+    assert np.abs(lengths[0] / lengths[1] - 1).mean() < 0.02
+
+
+def test_the_method_as_printed_moves_the_template_onto_the_scan(garment, scan_of) -> None:
+    config = replace(PAPER, graph=GraphConfig(nodes=40, vertices=0))
+    start = garment.template.vertices.astype(float)
+    truth = bend(start)
+    result = fit(garment, scan_of(bend), start, config)
+    before, after = (np.linalg.norm(points - truth, axis=1).mean() for points in (start, result.vertices))
+    assert after < 0.6 * before
+
+
+def test_the_cold_graph_stage_has_its_own_compression(garment, scan_of, config) -> None:
+    """Of what the dense stage does with compression the graph knows nothing."""
+    graph_only = replace(config, dense=replace(config.dense, cold=replace(config.dense.cold, steps=0)))
+    start, scan = garment.template.vertices.astype(float), scan_of(lambda points: points * [1.0, 0.9, 1.0])
+
+    def found(changed: RegistrationConfig) -> np.ndarray:
+        return fit(garment, scan, start, changed).vertices
+
+    usual = found(graph_only)
+    loose = replace(graph_only, dense=replace(graph_only.dense, compression=0.0))
+    np.testing.assert_array_equal(found(loose), usual)
+    free = found(replace(graph_only, coarse=replace(graph_only.coarse, cold_compression=0.0)))
+    assert np.ptp(free[:, 1]) < np.ptp(usual[:, 1])

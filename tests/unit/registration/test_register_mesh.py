@@ -1,6 +1,7 @@
 """Any template on any scan: units, order, borders, refusals."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 from capture4d.errors import InputError
 from capture4d.mesh_files import read_mesh, write_mesh
 from capture4d.types import Mesh
-from registration.config import SOFT, MeshRegistrationConfig, Schedule
+from registration.config import SOFT, MeshRegistrationConfig, QualityConfig, Schedule
 from registration.register_mesh import guess_units, register_mesh, run
 
 PAINT = (255, 210, 0)
@@ -99,6 +100,29 @@ def test_refusals(garment, scan_of, quick) -> None:
 
 def test_units_are_guessed_from_size(garment) -> None:
     assert [guess_units(scaled(garment.template, factor)) for factor in (1, 100, 1000)] == ["m", "cm", "mm"]
+
+
+@pytest.mark.parametrize("metres", [0.9, 1.2, 1.4])
+def test_a_shirt_has_its_unit_guessed(garment, metres: float) -> None:
+    diagonal = np.linalg.norm(np.ptp(garment.template.vertices, axis=0))
+    shirt = scaled(garment.template, metres / diagonal)
+    assert [guess_units(scaled(shirt, factor)) for factor in (1, 100, 1000)] == ["m", "cm", "mm"]
+
+
+def test_reasons_give_the_lengths_of_the_files_world(garment, scan_of, quick) -> None:
+    """Limits are made for a shirt; for a thing of half its size they count half, as what they are held against does."""
+    strict = replace(quick, registration=replace(quick.registration, quality=QualityConfig(fit_check_mm=1e-6)))
+    template, scan = garment.template, scan_of(swell).mesh
+    for factor in (1.0, 100.0):
+        units = "m" if factor == 1.0 else "cm"
+        quality = register_mesh(
+            scaled(template, factor), scaled(scan, factor), config=replace(strict, units=units)
+        ).quality
+        (reason,) = [reason for reason in quality.reasons if reason.startswith("fit_mean_mm")]
+        value, limit = (float(text) for text in re.findall(r"[\d.e-]+(?= >| mm)", reason))
+        assert value == pytest.approx(quality.numbers["fit_mean_mm"], rel=0.06)
+        size = np.linalg.norm(np.ptp(template.vertices, axis=0))
+        assert limit == pytest.approx(1e-6 * size / 1.2, rel=0.01)
 
 
 def test_schedules_anneal_geometrically() -> None:

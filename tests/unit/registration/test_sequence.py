@@ -10,7 +10,8 @@ from capture4d.body import pose_frame, skin
 from capture4d.errors import InputError
 from capture4d.types import Body, Garment, Mesh, PoseSequence
 from registration.config import SequenceConfig
-from registration.sequence import Mover, register_run, segments
+from registration.register import prepare_frame
+from registration.sequence import Mover, _choose, _predictions, register_run, segments
 from registration.template import analyse_template
 
 FRAMES = 6
@@ -152,3 +153,42 @@ def test_without_a_body_frames_follow_one_another(garment, body, poses, config, 
     assert [result.quality.verdict for result in results] == ["good"] * FRAMES
     assert results[0].started_from == "template, cold"
     assert results[1].started_from.startswith("previous")
+
+
+def test_paints_of_unknown_loops_end_the_run_at_once(bound, body, poses, config, load) -> None:
+    analysis = analyse_template(bound, config)
+    read, asked = load(analysis), []
+
+    def misnamed(frame_id: int):
+        asked.append(frame_id)
+        return replace(read(frame_id), loop_names=("waist", "collar"))
+
+    with pytest.raises(InputError, match="expected border loops named collar, waist"):
+        go(analysis, Mover.create(analysis, body, poses), misnamed, config)
+    assert asked == [0]
+
+
+def test_where_the_hem_lags_the_blend_is_nearer_than_both_its_parts(bound, body, poses, config, scan_of) -> None:
+    """Everything turns, but the hem stays where it was: what is carried misses the hem, what is left misses the top."""
+    analysis = analyse_template(bound, config)
+    frame = 5
+    spread = replace(poses, rotations=poses.rotations.copy())
+    spread.rotations[:, 0] = Rotation.from_euler("z", np.linspace(0, 10, FRAMES)[:, None], degrees=True).as_matrix()
+    mover = Mover.create(analysis, body, spread)
+
+    def place(points: np.ndarray) -> np.ndarray:
+        """The upper half where the bones take it, the hem where it was the frame before."""
+        weights = weights_at(points)
+        now, then = (skin(points, weights, pose_frame(mover.shaped, spread, at).transforms) for at in (frame, 3))
+        share = np.clip((points[:, 1:2] - 0.2) / 0.1, 0, 1)
+        return share * now + (1 - share) * then
+
+    before = mover.skinned(3).astype(np.float32)
+    scan = prepare_frame(analysis, scan_of(place), config)
+    parts = _predictions(analysis, mover, frame, (before, 3), config)
+    name, start, _ = _choose(analysis, scan, parts, False, config)
+    assert name == "blended"
+    assert set(parts) == {"carried", "previous", "skinned"}, "what is handed in stays"
+    truth = place(analysis.rest)
+    error = {key: np.linalg.norm(vertices - truth, axis=1).mean() for key, vertices in {**parts, name: start}.items()}
+    assert error["blended"] < 0.7 * min(error["carried"], error["previous"])
