@@ -318,6 +318,26 @@ def test_run_does_every_stage_and_a_second_run_nothing(
     assert "no metric 'beauty'" in fails(capsys, "report", work, "--fail-above", "beauty=1")
 
 
+def test_run_reports_a_take_with_a_scan_that_is_cut_short(tube_capture: Path, work: Path):
+    path = tube_capture / "scans" / "000006.ply"
+    path.write_bytes(path.read_bytes()[:1000])
+    assert run("run", tube_capture, "--output", work, "--workers", "1") == 0
+    page = (work / "report" / "index.html").read_text()
+    assert "000006.ply: cut off" in page
+    assert 'alt="no scan, frame 6"' in page
+    metrics = json.loads((work / "report" / "metrics.json").read_text())["metrics"]
+    assert {entry["key"]: entry["value"] for entry in metrics}["frames_failed"] == 1
+
+
+def test_run_reports_a_take_in_which_every_frame_failed(tube_capture: Path, work: Path):
+    template = load_garment(tube_capture / "template.npz")
+    far = template.template.with_vertices(template.template.vertices + np.float32(9))
+    save_garment(tube_capture / "template.npz", replace(template, template=far))
+    assert run("run", tube_capture, "--output", work, "--workers", "1") == 0
+    metrics = json.loads((work / "report" / "metrics.json").read_text())["metrics"]
+    assert {entry["key"]: entry["value"] for entry in metrics}["frames_failed"] == 3
+
+
 def test_register_mesh_keeps_the_templates_faces_and_measures(
     tube_capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
