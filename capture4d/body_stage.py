@@ -33,7 +33,7 @@ from capture4d.motion_files import read_motion
 from capture4d.records import ArrayFile, load_body, load_poses, save_body, save_poses
 from capture4d.scan_points import scan_points
 from capture4d.scans import Capture, capture_digest, read_body, read_capture, read_scan, scan_path
-from capture4d.take_colours import take_colours
+from capture4d.take_colours import forget_learned_colours, take_colours
 from capture4d.types import Body, PoseSequence
 from capture4d.workdir import (
     Stage,
@@ -75,9 +75,12 @@ def run(capture: Path, output: Path, config: TrackingConfig, *, workers: int = 1
         sources={"capture": capture},
         overwrite=overwrite,
     )
+    _tracker.cache_clear()
+    forget_learned_colours()
     if not (output / "body.npz").is_file():
         save_body(output / "body.npz", read_body(description) or load_anny())
     _follow(description, stage, config, workers)
+    _require_found(description, stage, config)
     shape = _take_shape(stage, description.frame_ids)
     jobs = [
         _RefineJob(capture, stage, config, frame_id, shape)
@@ -147,9 +150,17 @@ def _follow_frames(job: _FollowJob) -> int:
             continue
         before = last if followed.lost_frames == 0 and last is not None and last.lost_frames == 0 else None
         last = followed
-    if last is None:
-        raise InputError(_points(capture, capture.frame_ids[0], job.config)[1])
     return len(pending)
+
+
+def _require_found(capture: Capture, stage: Stage, config: TrackingConfig) -> None:
+    """See that the first pass had a scan to start from, in this run or an earlier one.
+
+    Raises:
+        InputError: no scan can be read; about the first.
+    """
+    if all(_load_followed(stage.frame_path(frame_id)).started_from == NOTHING for frame_id in capture.frame_ids):
+        raise InputError(_points(capture, capture.frame_ids[0], config)[1])
 
 
 @lru_cache(maxsize=1)
@@ -185,6 +196,8 @@ def _start(tracker: Tracker, config: TrackingConfig, frame_id: int) -> BodyState
 
 
 def _save_followed(path: Path, followed: Followed, cpu_s: float) -> None:
+    """The time first: the frame counts as done once its npz is there."""
+    write_json(path.parents[1] / "times" / f"{path.stem}.json", {"cpu_s": round(cpu_s, 4)})
     write_npz(
         path,
         rotations=followed.state.rotations,
@@ -197,7 +210,6 @@ def _save_followed(path: Path, followed: Followed, cpu_s: float) -> None:
         lost_frames=followed.lost_frames,
         doubtful_frames=followed.doubtful_frames,
     )
-    write_json(path.parents[1] / "times" / f"{path.stem}.json", {"cpu_s": round(cpu_s, 4)})
 
 
 def _load_followed(path: Path) -> Followed:

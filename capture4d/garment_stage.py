@@ -21,7 +21,7 @@ from capture4d.errors import InputError
 from capture4d.garment_extraction import ColourNotFoundError
 from capture4d.records import ArrayFile
 from capture4d.scans import Capture, capture_digest, format_colour, read_capture, read_scan, scan_path
-from capture4d.take_colours import KnownColours, cut_out, take_colours
+from capture4d.take_colours import KnownColours, cut_out, forget_learned_colours, take_colours
 from capture4d.types import GarmentScan, Mesh
 from capture4d.workdir import Stage, open_stage, run_jobs, write_json, write_npz
 
@@ -57,6 +57,7 @@ def run(capture: Path, output: Path, *, learn_colours: bool = False, workers: in
         sources={"capture": capture},
         overwrite=overwrite,
     )
+    forget_learned_colours()
     colours_path = stage.path / "colours.json"
     pending = [*stage.pending(description.frame_ids), *_damaged(stage, description.frame_ids)]
     if pending or not colours_path.is_file():

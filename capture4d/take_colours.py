@@ -20,7 +20,7 @@ from capture4d.garment_extraction import extract_garment
 from capture4d.scans import Capture, Colour, read_capture, read_scan, read_template
 from capture4d.types import GarmentScan, Scan
 
-__all__ = ["KnownColours", "cut_out", "take_colours"]
+__all__ = ["KnownColours", "cut_out", "forget_learned_colours", "take_colours"]
 
 FRAMES = 4
 """Scans that colours are learned from."""
@@ -56,6 +56,11 @@ def take_colours(capture: Capture, *, learn: bool = False) -> KnownColours:
     if capture.garment_colour is not None and not learn:
         return KnownColours(capture.garment_colour, capture.boundary_colours, tuple(capture.boundary_colours))
     return _learned(capture.path.resolve(), capture.garment_colour, tuple(capture.boundary_colours.items()))
+
+
+def forget_learned_colours() -> None:
+    """Learn anew when next asked: the files of a take may have changed since. A stage does this once, as it begins."""
+    _learned.cache_clear()
 
 
 @lru_cache(maxsize=1)
