@@ -207,7 +207,12 @@ def _draw_row(
         errors["correspondence error"] = (values, scales["correspondence error"])
     colours = dict(capture.boundary_colours)
     return row, draw_frame(
-        readable_scan(capture, frame_id), registered.garment, vertices, framing, errors_mm=errors, border_colours=colours
+        readable_scan(capture, frame_id),
+        registered.garment,
+        vertices,
+        framing,
+        errors_mm=errors,
+        border_colours=colours,
     )
 
 
