@@ -14,7 +14,6 @@ docs/conventions.md describes every file, so that it can be written without this
 from __future__ import annotations
 
 import hashlib
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -23,6 +22,7 @@ from typing import Literal, get_args
 import numpy as np
 from jaxtyping import Float32, Int32, UInt8
 
+from capture4d.colours import Colour, format_colour, parse_colour
 from capture4d.errors import InputError
 from capture4d.mesh import boundary_loops
 from capture4d.mesh_files import MESH_SUFFIXES, read_coloured_mesh, read_mesh, write_mesh
@@ -81,9 +81,6 @@ __all__ = [
 ]
 
 _FORMAT = 1
-
-Colour = tuple[int, int, int]
-"""sRGB, 0 to 255."""
 
 Units = Literal["m", "cm", "mm", "in"]
 METRES: dict[Units, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
@@ -153,14 +150,6 @@ class TruthFrame:
 # --- description and scans ---------------------------------------------------------------------------------------
 
 
-def parse_colour(text: str) -> Colour:
-    """'#2f62c9' or '2f62c9' as numbers."""
-    if not isinstance(text, str) or not re.fullmatch(r"#?[0-9a-fA-F]{6}", text):
-        raise InputError(f"expected a colour such as #2f62c9, found '{text}'")
-    red, green, blue = bytes.fromhex(text.removeprefix("#"))
-    return red, green, blue
-
-
 def _optional_colour(text: str | None) -> Colour | None:
     return None if text is None else parse_colour(text)
 
@@ -170,10 +159,6 @@ def _parse_units(text: str) -> Units:
         if text == units:
             return units
     raise InputError(f"expected units {', '.join(get_args(Units))}, found '{text}'")
-
-
-def format_colour(colour: Colour) -> str:
-    return "#{:02x}{:02x}{:02x}".format(*colour)
 
 
 def read_capture(path: str | Path, *, scans: bool = True) -> Capture:
