@@ -135,7 +135,8 @@ def _facts(
     poses: PoseSequence | None,
 ) -> TakeFacts:
     units = claims.units or description.get("units", "m")
-    if units not in METRES:
+    declared = next((metres for name, metres in METRES.items() if name == units), None)
+    if declared is None:
         raise InputError(f"units: expected one of {', '.join(METRES)}, found '{units}'")
     fps = claims.fps if claims.fps is not None else description.get("fps")
     if fps is not None and not float(fps) > 0:
@@ -150,7 +151,7 @@ def _facts(
     listed = description.get("frames")
     return TakeFacts(
         fps=None if fps is None else float(fps),
-        declared=METRES[units],
+        declared=declared,
         paints=Paints(parse_colour(garment) if garment else None, tuple(parse_colour(colour) for colour in borders)),
         border_names=tuple(tuple(names) for names in borders.values()),
         frame_ids=frame_ids,
