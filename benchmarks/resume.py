@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -18,7 +19,7 @@ from benchmarks.metric import Metric
 from capture4d.scans import read_capture
 from capture4d.workdir import read_json
 
-STAGES = ("garment", "registration")
+STAGES, TRACKED = ("garment", "registration"), ("garment", "body", "registration")
 
 
 def run(
@@ -26,6 +27,7 @@ def run(
     quick: bool = False,
     capture: Path | None = None,
     kills: int = 10,
+    track: bool = False,
     workers: int = 2,
     seed: int = 0,
 ) -> list[Metric]:
@@ -35,12 +37,14 @@ def run(
         quick: three kills instead of ten.
         capture: capture folder to run on; a tiny synthetic one if absent.
         kills: how often, each time on a fresh work folder, at a moment anywhere between start and end.
+        track: track the body as well, which takes most of the time; its digest is compared too.
         workers: processes of the killed run, which die with it.
         seed: of the moments.
     """
     console = Console(stderr=True)
     moments = random.Random(seed)
     trials = min(kills, 3) if quick else kills
+    stages, options = (TRACKED, ("--track",)) if track else (STAGES, ())
     with tempfile.TemporaryDirectory(prefix="capture4d-resume-") as scratch:
         folder = Path(scratch)
         if capture is None:
@@ -49,21 +53,21 @@ def run(
         frames = len(read_capture(capture).frame_ids)
 
         started = time.perf_counter()
-        _run_to_the_end(capture, folder / "whole", workers)
+        _run_to_the_end(capture, folder / "whole", workers, options)
         whole = time.perf_counter() - started
-        expected = _digests(folder / "whole")
+        expected = _digests(folder / "whole", stages)
 
         same = interrupted = 0
         for trial in range(trials):
             work = folder / "killed"
-            alive = _kill_after(moments.uniform(0.0, whole), capture, work, workers)
+            alive = _kill_after(moments.uniform(0.0, whole), capture, work, workers, options)
             done = len(list(work.glob("*/frames/*.npz")))
-            _run_to_the_end(capture, work, workers)
-            found = _digests(work)
+            _run_to_the_end(capture, work, workers, options)
+            found = _digests(work, stages)
             same += found == expected
             interrupted += alive
             console.print(
-                f"kill {trial}: after {done} of {len(STAGES) * frames} frames, same digests: {found == expected}"
+                f"kill {trial}: after {done} of {len(stages) * frames} frames, same digests: {found == expected}"
             )
             shutil.rmtree(work)
     return [
@@ -80,14 +84,14 @@ def _command(*words: object) -> None:
     subprocess.run(_arguments(*words), check=True, stdout=subprocess.DEVNULL)
 
 
-def _run_to_the_end(capture: Path, work: Path, workers: int) -> None:
-    _command("run", capture, "--output", work, "--workers", workers)
+def _run_to_the_end(capture: Path, work: Path, workers: int, options: Sequence[str]) -> None:
+    _command("run", capture, "--output", work, "--workers", workers, *options)
 
 
-def _kill_after(seconds: float, capture: Path, work: Path, workers: int) -> bool:
+def _kill_after(seconds: float, capture: Path, work: Path, workers: int, options: Sequence[str]) -> bool:
     """Start a run and kill it, and only it, after a time; whether it was still at work."""
     process = subprocess.Popen(
-        _arguments("run", capture, "--output", work, "--workers", workers),
+        _arguments("run", capture, "--output", work, "--workers", workers, *options),
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
@@ -100,5 +104,5 @@ def _kill_after(seconds: float, capture: Path, work: Path, workers: int) -> bool
     return False
 
 
-def _digests(work: Path) -> list[str]:
-    return [read_json(work / stage / "stage.json")["digest"] for stage in STAGES]
+def _digests(work: Path, stages: Sequence[str]) -> list[str]:
+    return [read_json(work / stage / "stage.json")["digest"] for stage in stages]

@@ -92,7 +92,8 @@ class Tracker:
         else:
             fit, name = self._fit(scan, start, self.config.cold_start.full, Expectation()), "start"
         quality = self._judge(scan, fit)
-        information = self._shape_information(fit)
+        shapes = len(fit.state.shape)
+        information = np.zeros((shapes, shapes)) if quality.reasons else self._shape_information(fit)
         return Followed(fit.state, information, quality, name, int(quality.lost), int(bool(quality.reasons)))
 
     def nothing(self, scan: ScanPoints) -> Followed:

@@ -47,9 +47,10 @@ SMPL_JOINTS = [
     "left_hand",
     "right_hand",
 ]
-EXPRESSION_START = 300
-"""SMPL-X keeps expression directions behind this many shape directions."""
+SHARED_JOINTS = 22
+"""The first joints of the whole family; then come hands, and in SMPL-X jaw and eyes before them."""
 MAX_SHAPES = 16
+"""The strongest components, which come first."""
 
 _NUMPY_NAMES = {"_reconstruct", "ndarray", "dtype", "scalar"}
 
@@ -111,7 +112,8 @@ def read_smpl(source: Path) -> Body:
 def _read_fields(source: Path) -> dict[str, np.ndarray]:
     if source.suffix.lower() == ".npz":
         with np.load(source, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files if archive[name].dtype.kind in "fiu"}
+            arrays = {name: _npz_array(archive, name) for name in archive.files}
+        return {name: value for name, value in arrays.items() if value is not None}
     if source.suffix.lower() != ".pkl":
         raise InputError(f"expected an .npz or .pkl file, found '{source.suffix}'")
     loaded = _ArraysOnly(io.BytesIO(source.read_bytes()), encoding="latin1").load()
@@ -119,6 +121,16 @@ def _read_fields(source: Path) -> dict[str, np.ndarray]:
         raise InputError(f"expected a dictionary of arrays, found {type(loaded).__name__}")
     arrays = {str(name): _as_array(value) for name, value in loaded.items()}
     return {name: value for name, value in arrays.items() if value is not None}
+
+
+def _npz_array(archive: Any, name: str) -> np.ndarray | None:
+    """An array of numbers; None for anything else, which is not unpickled."""
+    try:
+        return _as_array(archive[name])
+    except ValueError as error:
+        if "allow_pickle" not in str(error):
+            raise
+        return None
 
 
 def _as_array(value: Any) -> np.ndarray | None:
@@ -136,11 +148,10 @@ def _as_array(value: Any) -> np.ndarray | None:
 
 def _assemble(fields: dict[str, np.ndarray]) -> Body:
     template = np.asarray(fields["v_template"], np.float64)
-    shapes = np.moveaxis(np.asarray(fields["shapedirs"], np.float64), 2, 0)[:EXPRESSION_START][:MAX_SHAPES]
+    shapes = np.moveaxis(np.asarray(fields["shapedirs"], np.float64), 2, 0)[:MAX_SHAPES]
     regressor = np.asarray(fields["J_regressor"], np.float64)
     parents = np.asarray(fields["kintree_table"])[0].astype(np.int64)
     parents[0] = -1
-    joints = len(parents)
     posedirs = fields.get("posedirs")
     pose_directions = None
     if posedirs is not None:
@@ -152,10 +163,16 @@ def _assemble(fields: dict[str, np.ndarray]) -> Body:
         shape_directions=shapes.astype(np.float32),
         joints=(regressor @ template).astype(np.float32),
         joint_directions=np.einsum("jv,svc->sjc", regressor, shapes).astype(np.float32),
-        joint_names=tuple(SMPL_JOINTS)
-        if joints == len(SMPL_JOINTS)
-        else tuple(f"joint_{j:02d}" for j in range(joints)),
+        joint_names=_joint_names(len(parents)),
         parents=parents.astype(np.int32),
         skin_weights=np.asarray(fields["weights"]).astype(np.float32),
         pose_directions=pose_directions,
     )
+
+
+def _joint_names(count: int) -> tuple[str, ...]:
+    """SMPL's, as far as the family shares them."""
+    if count == len(SMPL_JOINTS):
+        return tuple(SMPL_JOINTS)
+    shared = SMPL_JOINTS[: min(SHARED_JOINTS, count)]
+    return (*shared, *(f"joint_{joint:02d}" for joint in range(len(shared), count)))

@@ -32,8 +32,8 @@ from capture4d.errors import InputError
 from capture4d.motion_files import read_motion
 from capture4d.records import ArrayFile, load_body, load_poses, save_body, save_poses
 from capture4d.scan_points import scan_points
-from capture4d.scans import Capture, capture_digest, read_body, read_capture, read_scan, scan_path
-from capture4d.take_colours import take_colours
+from capture4d.scans import Capture, body_digest, capture_digest, read_body, read_capture, read_scan, scan_path
+from capture4d.take_colours import forget_learned_colours, take_colours
 from capture4d.types import Body, PoseSequence
 from capture4d.workdir import (
     Stage,
@@ -49,7 +49,7 @@ from capture4d.workdir import (
 
 __all__ = ["load_tracking", "run", "tracking_digest"]
 
-SCHEMA = 3
+SCHEMA = 4
 STARTS = ("search", "rest")
 
 
@@ -61,6 +61,8 @@ def run(capture: Path, output: Path, config: TrackingConfig, *, workers: int = 1
     """
     description = read_capture(capture)
     upstream = {"capture": capture_digest(description)}
+    if digest := body_digest(description):
+        upstream["body"] = digest
     if config.start not in STARTS:
         start_file = Path(config.start)
         if not start_file.is_file():
@@ -75,9 +77,12 @@ def run(capture: Path, output: Path, config: TrackingConfig, *, workers: int = 1
         sources={"capture": capture},
         overwrite=overwrite,
     )
+    _tracker.cache_clear()
+    forget_learned_colours()
     if not (output / "body.npz").is_file():
         save_body(output / "body.npz", read_body(description) or load_anny())
-    _follow(description, stage, config, workers)
+    followed = _follow(description, stage, config, workers)
+    _require_found(description, stage, config)
     shape = _take_shape(stage, description.frame_ids)
     jobs = [
         _RefineJob(capture, stage, config, frame_id, shape)
@@ -85,16 +90,22 @@ def run(capture: Path, output: Path, config: TrackingConfig, *, workers: int = 1
     ]
     for _ in run_jobs(_refine_frame, jobs, workers=workers, label="refine poses"):
         pass
-    return _collect(description, stage, config, shape)
+    gathered = all((output / name).is_file() for name in ("poses.npz", "metrics.jsonl"))
+    changed = followed or bool(jobs) or not gathered or not stage.was_complete
+    if changed:
+        _gather(description, stage, config, shape)
+    refined = [stage.frame_path(frame_id, folder="refined") for frame_id in description.frame_ids]
+    return stage.finish([output / "body.npz", output / "poses.npz", *refined], changed=changed)
 
 
 def tracking_digest(folder: Path, capture: Path) -> str:
     """Digest of a finished tracking.
 
     Raises:
-        InputError: it is missing or unfinished.
+        InputError: it is missing, unfinished, or that of other scans.
     """
-    return require_complete(folder, "track", f"capture4d track {capture} --output {folder.parent}")
+    command = f"capture4d track {capture} --output {folder.parent}"
+    return require_complete(folder, "track", command, made_from={"capture": capture_digest(read_capture(capture))})
 
 
 def load_tracking(folder: Path) -> tuple[Body, PoseSequence]:
@@ -105,17 +116,18 @@ def load_tracking(folder: Path) -> tuple[Body, PoseSequence]:
 # --- first pass --------------------------------------------------------------------------------------------------
 
 
-def _follow(capture: Capture, stage: Stage, config: TrackingConfig, workers: int) -> None:
-    """One frame after the other, from where an earlier run stopped."""
+def _follow(capture: Capture, stage: Stage, config: TrackingConfig, workers: int) -> bool:
+    """One frame after the other, from where an earlier run stopped; whether there was anything left to do."""
     frame_ids = capture.frame_ids
     if not stage.pending(frame_ids):
-        return
+        return False
     job = _FollowJob(capture.path, stage, config)
     for _ in run_jobs(
         _follow_frames, [job], workers=min(workers, 1), label="track body", units=lambda _: len(frame_ids),
-        finished=lambda: len(frame_ids) - len(stage.pending(frame_ids)),
+        finished=stage.count,
     ):  # fmt: skip
         pass
+    return True
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,9 +159,17 @@ def _follow_frames(job: _FollowJob) -> int:
             continue
         before = last if followed.lost_frames == 0 and last is not None and last.lost_frames == 0 else None
         last = followed
-    if last is None:
-        raise InputError(_points(capture, capture.frame_ids[0], job.config)[1])
     return len(pending)
+
+
+def _require_found(capture: Capture, stage: Stage, config: TrackingConfig) -> None:
+    """See that the first pass had a scan to start from, in this run or an earlier one.
+
+    Raises:
+        InputError: no scan can be read; about the first.
+    """
+    if all(_load_followed(stage.frame_path(frame_id)).started_from == NOTHING for frame_id in capture.frame_ids):
+        raise InputError(_points(capture, capture.frame_ids[0], config)[1])
 
 
 @lru_cache(maxsize=1)
@@ -185,6 +205,8 @@ def _start(tracker: Tracker, config: TrackingConfig, frame_id: int) -> BodyState
 
 
 def _save_followed(path: Path, followed: Followed, cpu_s: float) -> None:
+    """The time first: the frame counts as done once its npz is there."""
+    write_json(path.parents[1] / "times" / f"{path.stem}.json", {"cpu_s": round(cpu_s, 4)})
     write_npz(
         path,
         rotations=followed.state.rotations,
@@ -197,7 +219,6 @@ def _save_followed(path: Path, followed: Followed, cpu_s: float) -> None:
         lost_frames=followed.lost_frames,
         doubtful_frames=followed.doubtful_frames,
     )
-    write_json(path.parents[1] / "times" / f"{path.stem}.json", {"cpu_s": round(cpu_s, 4)})
 
 
 def _load_followed(path: Path) -> Followed:
@@ -324,8 +345,8 @@ def _with_take(records: Sequence[dict[str, Any]], config: SequenceConfig) -> lis
     return flagged
 
 
-def _collect(capture: Capture, stage: Stage, config: TrackingConfig, shape: tuple[float, ...]) -> str:
-    """Gather the frames, close the stage."""
+def _gather(capture: Capture, stage: Stage, config: TrackingConfig, shape: tuple[float, ...]) -> None:
+    """Poses and metrics of all frames."""
     paths = [stage.frame_path(frame_id, folder="refined") for frame_id in capture.frame_ids]
     rotations, translations = [], []
     for path in paths:
@@ -347,4 +368,3 @@ def _collect(capture: Capture, stage: Stage, config: TrackingConfig, shape: tupl
     records = [read_json(stage.frame_path(frame_id, ".json", folder="metrics")) for frame_id in capture.frame_ids]
     lines = [json.dumps(record) for record in _with_take(records, config.sequence)]
     write_bytes(stage.path / "metrics.jsonl", ("\n".join(lines) + "\n").encode())
-    return stage.finish([stage.path / "body.npz", stage.path / "poses.npz", *paths])

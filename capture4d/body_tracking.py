@@ -66,7 +66,6 @@ class Fit:
     """Metres: signed along the body's normal, of the points whose normals agree; NaN for the others."""
     information: Float64[np.ndarray, "parameters parameters"]
     """Normal equations at the end."""
-    iterations: int
 
     def shape_information(self) -> Float64[np.ndarray, "shapes shapes"]:
         """What the frame says about the shape once its pose is eliminated (Schur complement)."""
@@ -104,10 +103,9 @@ def fit_body(
     expectation = expectation or Expectation()
     state, pose = start, 3 + 3 * len(start.rotations)
     size = pose if fixed_shape else pose + len(start.shape)
-    information, distances, done = np.zeros((size, size)), np.zeros(0), 0
+    information, distances = np.zeros((size, size)), np.zeros(0)
     ratio = schedule.last_scale_m / schedule.first_scale_m
     for step in range(schedule.iterations):
-        done = step + 1
         scale = schedule.first_scale_m * ratio ** (step / max(schedule.iterations - 1, 1))
         surface = pose_surface(model, state)
         matches = match(surface, scan.points, scan.normals)
@@ -126,7 +124,7 @@ def fit_body(
             state = moved
             break
         state = moved
-    return Fit(state, distances, information, done)
+    return Fit(state, distances, information)
 
 
 def _weigh(

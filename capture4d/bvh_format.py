@@ -16,6 +16,8 @@ from capture4d.errors import InputError
 
 __all__ = ["Bvh", "format_bvh", "read_bvh"]
 
+CHANNELS = {f"{axis}{kind}" for axis in "XYZ" for kind in ("position", "rotation")}
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bvh:
@@ -53,7 +55,7 @@ def read_bvh(path: Path) -> Bvh:
         raise InputError(f"{path}: no such BVH file")
     lines = path.read_text(errors="replace").splitlines()
     names, parents, offsets, channels, stack = [], [], [], [], []
-    number, in_end_site, motion_at = 0, False, None
+    number, in_end_site, motion_at, pending = 0, False, None, None
     try:
         for number, line in enumerate(lines, start=1):
             words = line.split()
@@ -69,6 +71,8 @@ def read_bvh(path: Path) -> Bvh:
                 case "End":
                     in_end_site, pending = True, -1
                 case "{":
+                    if pending is None:
+                        raise ValueError("a brace before the first joint")
                     stack.append(pending)
                 case "}":
                     in_end_site = False
@@ -77,13 +81,23 @@ def read_bvh(path: Path) -> Bvh:
                     offsets[stack[-1]] = tuple(float(word) for word in words[1:4])
                 case "CHANNELS":
                     channels[stack[-1]] = words[2 : 2 + int(words[1])]
+                    if not set(channels[stack[-1]]) <= CHANNELS:
+                        raise ValueError(f"expected channels {', '.join(sorted(CHANNELS))}")
                 case "MOTION":
                     motion_at = number
                     break
         if motion_at is None:
             raise InputError(f"{path}: expected a MOTION section, found the end of the file at line {number}")
+        if not names:
+            raise InputError(f"{path}: expected a joint tree, found a MOTION section without one")
+        number = motion_at + 1
         count = int(lines[motion_at].split(":")[1])
+        if count < 1:
+            raise InputError(f"{path}, line {number}: expected at least one frame, found {count}")
+        number = motion_at + 2
         frame_time = float(lines[motion_at + 1].split(":")[1])
+        if not 0 < frame_time < np.inf:
+            raise InputError(f"{path}, line {number}: expected a positive frame time, found {frame_time:g}")
         width = sum(len(each) for each in channels)
         rows = []
         for number in range(motion_at + 3, motion_at + 3 + count):
@@ -96,6 +110,8 @@ def read_bvh(path: Path) -> Bvh:
             raise
         raise InputError(f"{path}, line {number}: not a BVH file, or cut short ({error})") from None
     values = np.array(rows)
+    if not np.isfinite(values).all():
+        raise InputError(f"{path}: expected finite channel values, found NaN or infinity")
     local, column, positions = [], 0, np.zeros((count, 3))
     for joint, each in enumerate(channels):
         block = dict(zip(each, values[:, column : column + len(each)].T, strict=True))
@@ -103,7 +119,7 @@ def read_bvh(path: Path) -> Bvh:
         order = "".join(name[0] for name in each if name.endswith("rotation"))
         angles = np.stack([block[f"{axis}rotation"] for axis in order], axis=1) if order else np.zeros((count, 3))
         local.append(Rotation.from_euler(order or "XYZ", angles, degrees=True).as_quat())
-        if joint == 0 and "Xposition" in block:
+        if joint == 0 and all(f"{axis}position" in block for axis in "XYZ"):
             positions = np.stack([block[f"{axis}position"] for axis in "XYZ"], axis=1)
     quaternions = np.stack(local, axis=1).reshape(-1, 4)
     return Bvh(

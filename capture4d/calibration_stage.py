@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -94,8 +95,11 @@ def run(
         write_model(colmap, calibration.estimate.rig)
     report = calibration_report(calibration, geometry, pose_names=poses, config=config)
     report = {"format": 1, "board": board, "images": len(found), "config": dataclasses.asdict(config), **report}
-    write_npz(output.with_name(COVARIANCE), names=np.array(names), covariance=calibration.covariance)
-    write_json(output.with_name(REPORT), report)
+    digest = _rig_digest(output)
+    write_npz(
+        output.with_name(COVARIANCE), names=np.array(names), covariance=calibration.covariance, rig=np.array(digest)
+    )
+    write_json(output.with_name(REPORT), {**report, "rig": digest})
     return report
 
 
@@ -117,10 +121,12 @@ def run_check(
     """
     rig = load_rig(rig_path)
     beside = rig_path.with_name(REPORT)
+    digest = _rig_digest(rig_path)
     report = read_json(beside) if beside.is_file() else {}
-    spec = board or report.get("board")
+    spec = board or (report.get("board") if report.get("rig") == digest else None)
     if spec is None:
-        raise InputError(f"--board: expected one, for there is no {beside} that names it")
+        fault = f"{beside} is of another {rig_path.name}" if report else f"there is no {beside} that names it"
+        raise InputError(f"--board: expected one, for {fault}")
     geometry = parse_board(spec)
     found = find_images(images, pattern)
     strangers = sorted({image.camera for image in found} - set(rig.names))
@@ -134,7 +140,7 @@ def run_check(
         if detection.size != (width, height):
             seen = "x".join(str(size) for size in detection.size)
             raise InputError(f"{detection.image.path}: expected {width}x{height} pixels as in the rig, found {seen}")
-    covariance = _read_covariance(rig_path.with_name(COVARIANCE), rig.names)
+    covariance = _read_covariance(rig_path.with_name(COVARIANCE), digest, cameras=len(rig.names))
     return check_rig(rig, _views(detections, rig.names, poses), geometry, covariance=covariance, config=config)
 
 
@@ -206,20 +212,27 @@ def _detect_all(
     keys = {image: _file_key(image, folder) for image in images}
     new = [image for image in images if keys[image] not in known]
     detections = {image: known[keys[image]] for image in images if keys[image] in known}
-    for detection in run_jobs(partial(_detect, board), new, workers=workers, label="find the board"):
-        detections[detection.image] = (detection.size, detection.ids, detection.pixels)
-    if new:
-        values = [detections[image] for image in images]
-        write_npz(
-            cache,
-            board=np.array(f"{board}, {DETECTOR}"),
-            keys=np.array([keys[image] for image in images]),
-            sizes=np.array([size for size, _, _ in values], np.int32),
-            counts=np.array([len(ids) for _, ids, _ in values], np.int32),
-            ids=np.concatenate([ids for _, ids, _ in values]),
-            pixels=np.concatenate([pixels for _, _, pixels in values]),
-        )
+    try:
+        for detection in run_jobs(partial(_detect, board), new, workers=workers, label="find the board"):
+            detections[detection.image] = (detection.size, detection.ids, detection.pixels)
+    finally:  # an image that cannot be read must not cost those that can
+        if new and detections:
+            _write_corners(cache, board, {keys[image]: found for image, found in detections.items()})
     return [_Detection(image, *detections[image]) for image in images]
+
+
+def _write_corners(
+    cache: Path, board: Board, found: Mapping[str, tuple[tuple[int, int], np.ndarray, np.ndarray]]
+) -> None:
+    write_npz(
+        cache,
+        board=np.array(f"{board}, {DETECTOR}"),
+        keys=np.array(list(found)),
+        sizes=np.array([size for size, _, _ in found.values()], np.int32),
+        counts=np.array([len(ids) for _, ids, _ in found.values()], np.int32),
+        ids=np.concatenate([ids for _, ids, _ in found.values()]),
+        pixels=np.concatenate([pixels for _, _, pixels in found.values()]),
+    )
 
 
 def _read_corners(cache: Path, board: Board) -> dict[str, tuple[tuple[int, int], np.ndarray, np.ndarray]]:
@@ -270,18 +283,21 @@ def _views(detections: Sequence[_Detection], names: Sequence[str], poses: Sequen
     ]
 
 
-def _read_covariance(path: Path, names: Sequence[str]) -> np.ndarray | None:
-    """Of the calibration, (C, 14, C, 14), if it is that of these cameras."""
+def _rig_digest(path: Path) -> str:
+    """What the files beside a rig.json name it by."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _read_covariance(path: Path, rig_digest: str, *, cameras: int) -> np.ndarray | None:
+    """Of the calibration, (C, 14, C, 14), if it is that of this rig."""
     if not path.is_file():
         return None
     with ArrayFile(path) as arrays:
-        if arrays.names("names") != tuple(names):
+        if str(arrays.get("rig")) != rig_digest:
             return None
         covariance = arrays["covariance"]
-    if covariance.shape != (len(names), CAMERA_UNKNOWNS) * 2:
-        raise InputError(
-            f"{path}: expected {len(names)} x {CAMERA_UNKNOWNS} unknowns squared, found {covariance.shape}"
-        )
+    if covariance.shape != (cameras, CAMERA_UNKNOWNS) * 2:
+        raise InputError(f"{path}: expected {cameras} x {CAMERA_UNKNOWNS} unknowns squared, found {covariance.shape}")
     return covariance
 
 

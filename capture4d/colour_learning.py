@@ -26,14 +26,13 @@ import numpy as np
 from jaxtyping import Float64, Real, UInt8
 from scipy.spatial import KDTree
 
+from capture4d.colours import Colour, format_colour
 from capture4d.errors import InputError
 from capture4d.garment_extraction import encode_colours, linear_colours, settle_labels
 from capture4d.mesh_kernels import face_components, open_vertices, vertex_normals_kernel
 from capture4d.types import Mesh, Scan
 
 __all__ = ["ColoursNotSeparableError", "Light", "TakeColours", "fit_light", "learn_colours"]
-
-Colour = tuple[int, int, int]
 
 SAMPLES = 6000
 """Vertices of a scan that the light and the colours are learned from."""
@@ -117,7 +116,7 @@ def learn_colours(
     if len(colours) < 2:
         raise ColoursNotSeparableError(
             f"{source}: the colours of garment and suit are not separable: found {len(colours)} colour "
-            f"({', '.join(_hex(colour) for colour in colours)}) in {len(scans)} scans, expected at least 2"
+            f"({', '.join(format_colour(colour) for colour in colours)}) in {len(scans)} scans, expected at least 2"
         )
     labels = [
         settle_labels(scan.mesh.faces, _nearest(colour, colours)) for scan, colour in zip(scans, flat, strict=True)
@@ -271,8 +270,8 @@ def _among(colour: Colour, materials: Sequence[Colour], source: str, role: str) 
     best = int(np.argmin(angle + 0.02 * np.abs(np.log((found.sum(axis=1) + 1e-4) / (given.sum() + 1e-4)))))
     if angle[best] > 2 * MODE_DISTANCE:
         raise ColoursNotSeparableError(
-            f"{source}: {role} colour {_hex(colour)} not found: expected it among the colours of the scans, "
-            f"found {', '.join(_hex(material) for material in materials)}"
+            f"{source}: {role} colour {format_colour(colour)} not found: expected it among the colours of the scans, "
+            f"found {', '.join(format_colour(material) for material in materials)}"
         )
     return best
 
@@ -282,12 +281,8 @@ def _require_apart(chosen: Sequence[int], colours: Sequence[Colour], source: str
     if twice:
         raise ColoursNotSeparableError(
             f"{source}: the colours given for garment and borders are not separable: two of them are "
-            f"{_hex(colours[twice[0]])} in the scans"
+            f"{format_colour(colours[twice[0]])} in the scans"
         )
-
-
-def _hex(colour: Colour) -> str:
-    return "#{:02x}{:02x}{:02x}".format(*colour)
 
 
 # --- roles -------------------------------------------------------------------------------------------------------
@@ -369,7 +364,8 @@ def _garment(
     ranked = np.argsort(-contact, kind="stable")
     if contact[ranked[0]] == 0 or contact[ranked[0]] < MARGIN * contact[ranked[1]]:
         raise ColoursNotSeparableError(
-            f"{source}: nothing tells the garment from the rest: {_hex(colours[ranked[0]])} and "
-            f"{_hex(colours[ranked[1]])} have as much of other colours along them; give garment_colour in capture.json"
+            f"{source}: nothing tells the garment from the rest: {format_colour(colours[ranked[0]])} and "
+            f"{format_colour(colours[ranked[1]])} have as much of other colours along them; "
+            "give garment_colour in capture.json"
         )
     return int(ranked[0])

@@ -25,6 +25,7 @@ from scipy.sparse import csgraph
 
 from capture4d.band_borders import border_beyond_rim
 from capture4d.border_loops import straighten
+from capture4d.colours import Colour, format_colour
 from capture4d.errors import InputError
 from capture4d.label_edges import sharpen_labels
 from capture4d.mesh_kernels import face_components, open_vertices
@@ -39,8 +40,6 @@ __all__ = [
     "painted_border",
     "settle_labels",
 ]
-
-Colour = tuple[int, int, int]
 
 OTHER, GARMENT, FIRST_PAINT = 0, 1, 2
 
@@ -96,7 +95,7 @@ def extract_garment(
     mask = _garment_faces(faces, labels)
     if not mask.any():
         raise ColourNotFoundError(
-            f"{source}: expected a connected garment of colour {_hex(garment_colour)}, found scattered specks"
+            f"{source}: expected a connected garment of colour {format_colour(garment_colour)}, found scattered specks"
         )
     used = np.zeros(len(labels), bool)
     used[faces[mask].reshape(-1)] = True
@@ -126,7 +125,7 @@ def painted_border(
     painted = classify_colours(colours, paint, ()) == GARMENT
     if painted.mean() < MIN_SHARE:
         raise ColourNotFoundError(
-            f"{source}: border colour {_hex(paint)} not found: expected at least {100 * MIN_SHARE:g} % of the "
+            f"{source}: border colour {format_colour(paint)} not found: expected at least {100 * MIN_SHARE:g} % of the "
             f"vertices, found {100 * painted.mean():.2g} %"
         )
     labels = settle_labels(mesh.faces, np.where(painted, FIRST_PAINT, GARMENT).astype(np.uint8))
@@ -183,13 +182,9 @@ def _require_colours(labels: np.ndarray, garment_colour: Colour, paints: tuple[C
     for index, (name, colour, least) in enumerate(wanted, start=GARMENT):
         if share[index] < least:
             raise ColourNotFoundError(
-                f"{source}: {name} {_hex(colour)} not found: expected at least {100 * least:g} % of the vertices, "
-                f"found {100 * share[index]:.2g} %"
+                f"{source}: {name} {format_colour(colour)} not found: expected at least "
+                f"{100 * least:g} % of the vertices, found {100 * share[index]:.2g} %"
             )
-
-
-def _hex(colour: Colour) -> str:
-    return "#{:02x}{:02x}{:02x}".format(*colour)
 
 
 def _garment_faces(faces: np.ndarray, labels: np.ndarray) -> np.ndarray:
@@ -238,6 +233,7 @@ def _border_points(
     straight = np.linalg.norm(across, axis=1)
     spacing = _spacing(mesh)
     paint_here = labels[rim]
+    sharp: np.ndarray | None = None
     ends = np.zeros(len(rim), bool) if whole is None else whole.goes_on[rim]
     for paint in range(FIRST_PAINT, FIRST_PAINT + paints):
         own = np.flatnonzero(paint_here == paint)
@@ -245,7 +241,8 @@ def _border_points(
             continue
         own = own[straight[own] >= FAR_SIDE * np.percentile(straight[own], 75)]
         if whole is not None and ends[own].mean() > CONNECTED:
-            sharp = sharpen_labels(whole.scan.mesh, whole.scan.colours, whole.labels)
+            if sharp is None:
+                sharp = sharpen_labels(whole.scan.mesh, whole.scan.colours, whole.labels)
             found = border_beyond_rim(whole.scan.mesh, sharp == GARMENT, sharp == paint)
         else:
             narrow, full = np.percentile(straight[own], (20, 90))

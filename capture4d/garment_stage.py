@@ -3,7 +3,8 @@
 Colours that capture.json does not give are learned from a few scans first, and written to colours.json. All must be in
 the first frame that can be read, or else capture.json is wrong. A later frame that lacks them, because the subject has
 left the volume or hides a border, and any frame whose scan is damaged, gets the reason instead of a garment, and
-registration flags it. Damaged scans are read again in every run, in case they were repaired.
+registration flags it. Damaged scans are read again in every run, in case they were repaired; other scans must not have
+changed.
 """
 
 from __future__ import annotations
@@ -20,14 +21,14 @@ import numpy as np
 from capture4d.errors import InputError
 from capture4d.garment_extraction import ColourNotFoundError
 from capture4d.records import ArrayFile
-from capture4d.scans import Capture, capture_digest, format_colour, read_capture, read_scan, scan_path
-from capture4d.take_colours import KnownColours, cut_out, take_colours
+from capture4d.scans import Capture, capture_digest, format_colour, read_capture, read_scan, scan_digest, scan_path
+from capture4d.take_colours import KnownColours, cut_out, forget_learned_colours, take_colours, template_loops
 from capture4d.types import GarmentScan, Mesh
 from capture4d.workdir import Stage, open_stage, run_jobs, write_json, write_npz
 
 __all__ = ["flagged_frames", "load_garment_scan", "run", "save_garment_scan"]
 
-SCHEMA = 2
+SCHEMA = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,44 +49,58 @@ def run(capture: Path, output: Path, *, learn_colours: bool = False, workers: in
             to be learned and are not separable.
     """
     description = read_capture(capture)
+    named = {}
+    if not description.boundary_colours and (learn_colours or description.garment_colour is None):
+        named["loops"] = " ".join(template_loops(description))
+    before = _unreadable_scans(output, description.frame_ids)
     stage = open_stage(
         output,
         name="extract",
         schema=SCHEMA,
         config=ExtractionSettings(learn_colours=learn_colours),
-        upstream={"capture": capture_digest(description)},
+        upstream={"capture": capture_digest(description), **named},
         sources={"capture": capture},
+        formerly={"capture": capture_digest(description, instead=before), **named} if before else None,
         overwrite=overwrite,
     )
+    forget_learned_colours()
     colours_path = stage.path / "colours.json"
-    pending = [*stage.pending(description.frame_ids), *_damaged(stage, description.frame_ids)]
+    pending = sorted({*stage.pending(description.frame_ids), *before})
     if pending or not colours_path.is_file():
         colours = take_colours(description, learn=learn_colours)
         write_json(colours_path, _described(colours))
         done = _extract_first(description, colours, stage, pending)
-        jobs = [(frame_id, stage.frame_path(frame_id)) for frame_id in sorted(pending) if frame_id != done]
+        jobs = [(frame_id, stage.frame_path(frame_id)) for frame_id in pending if frame_id != done]
         for _ in run_jobs(partial(write_frame, description, colours), jobs, workers=workers, label="extract garment"):
             pass
-    return stage.finish([colours_path, *(stage.frame_path(frame_id) for frame_id in description.frame_ids)])
+    frames = [stage.frame_path(frame_id) for frame_id in description.frame_ids]
+    return stage.finish([colours_path, *frames], changed=bool(pending))
 
 
 def flagged_frames(folder: Path) -> dict[int, str]:
     """Frames of an extraction without a garment, and why, in ascending order."""
-    reasons = {int(path.stem): _reason(path)[0] for path in sorted((folder / "frames").glob("*.npz"))}
+    reasons = {int(path.stem): _reason(path) for path in sorted((folder / "frames").glob("*.npz"))}
     return {frame_id: reason for frame_id, reason in reasons.items() if reason}
 
 
-def _damaged(stage: Stage, frame_ids: Sequence[int]) -> list[int]:
-    """Frames whose scan an earlier run could not read."""
-    done = sorted(set(frame_ids) - set(stage.pending(frame_ids)))
-    return [frame_id for frame_id in done if _reason(stage.frame_path(frame_id))[1]]
+def _unreadable_scans(folder: Path, frame_ids: Sequence[int]) -> dict[int, str]:
+    """Frames whose scan an earlier run could not read, and what that scan's digest was."""
+    found = {}
+    for frame_id in frame_ids:
+        path = folder / "frames" / f"{frame_id:06d}.npz"
+        if zipfile.is_zipfile(path):
+            with ArrayFile(path) as arrays:
+                digest = arrays.get("scan")
+            if digest is not None:
+                found[frame_id] = str(digest)
+    return found
 
 
-def _reason(path: Path) -> tuple[str, bool]:
-    """Why a frame has no garment, nothing if it has one; and whether that is because its scan is damaged."""
+def _reason(path: Path) -> str:
+    """Why a frame has no garment, nothing if it has one."""
     with ArrayFile(path) as arrays:
         reason = arrays.get("reason")
-        return ("", False) if reason is None else (str(reason), bool(arrays["damaged"]))
+        return "" if reason is None else str(reason)
 
 
 def _extract_first(capture: Capture, colours: KnownColours, stage: Stage, pending: Sequence[int]) -> int | None:
@@ -134,7 +149,8 @@ def write_frame(capture: Capture, colours: KnownColours, job: tuple[int, Path]) 
         save_garment_scan(path, extract_frame(capture, colours, frame_id))
     except InputError as error:
         damaged = not isinstance(error, ColourNotFoundError)
-        write_npz(path, reason=np.array(str(error)), damaged=np.array(damaged))
+        source = {"scan": np.array(scan_digest(scan_path(capture, frame_id)))} if damaged else {}
+        write_npz(path, reason=np.array(str(error)), **source)
 
 
 def save_garment_scan(path: Path, scan: GarmentScan) -> None:

@@ -19,7 +19,7 @@ from capture4d.body import PosedBody, unskin
 from capture4d.body_tracking_jacobian import PosedSurface, match, tracked_body
 from capture4d.errors import InputError
 from capture4d.garment_binding import WEIGHT_SMOOTHING, diffuse
-from capture4d.mesh import boundary_loops, unique_edges, vertex_normals
+from capture4d.mesh import boundary_loops, vertex_normals
 from capture4d.types import Body, Garment, Mesh
 from capture4d.uv_atlas import UvReport, check_uv, fresh_uv
 
@@ -135,7 +135,7 @@ def _require_surface(mesh: Mesh, source: str) -> None:
         raise InputError(f"{source}: expected every vertex in a face, found {unused} in none")
     if not (uses == 1).any():
         raise InputError(f"{source}: expected a garment with open borders, found a closed surface")
-    if len(unique_edges(mesh.faces)) != len(uses) or _has_mixed_winding(mesh):
+    if _has_mixed_winding(mesh):
         raise InputError(f"{source}: expected faces wound alike, found neighbours wound against each other")
 
 

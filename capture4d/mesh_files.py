@@ -8,6 +8,8 @@ formats the line.
 from __future__ import annotations
 
 import re
+import struct
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -62,13 +64,18 @@ def read_coloured_mesh(path: str | Path) -> MeshFile:
     found = read_mesh(path)
     if found.colours is not None:
         return found
-    if path.suffix.lower() == ".glb":
-        mesh, picture = _textured_glb(path)
-    else:
-        mesh, picture = found.mesh, _texture_file(path)
-    if picture is None or mesh.uv is None:
+    if path.suffix.lower() != ".glb":
+        picture = _texture_file(path)
+        if picture is None or found.mesh.uv is None:
+            return found
+        return replace(found, colours=texture_colours(found.mesh, _picture_file(picture, path)))
+    try:
+        mesh, pixels = _textured_glb(path)
+    except Exception as error:  # whatever trimesh and Pillow meet in a damaged file
+        raise InputError(f"{path}: not a readable texture, damaged or too large ({_one_line(error)})") from None
+    if pixels is None or mesh.uv is None:
         return found
-    return replace(found, mesh=mesh, colours=texture_colours(mesh, _pixels(picture, path)))
+    return replace(found, mesh=mesh, colours=texture_colours(mesh, pixels))
 
 
 def write_mesh(
@@ -112,8 +119,8 @@ def _read_glb(path: Path) -> MeshFile:
     return MeshFile(Mesh(np.asarray(mesh.vertices, np.float32).reshape(-1, 3), faces, uv), colours)
 
 
-def _textured_glb(path: Path) -> tuple[Mesh, Any]:
-    """The mesh with its UVs, and its base colour image or None."""
+def _textured_glb(path: Path) -> tuple[Mesh, UInt8[np.ndarray, "rows columns 3"] | None]:
+    """The mesh with its UVs, and the pixels of its base colour or None."""
     import trimesh
 
     scene = trimesh.load_scene(path, file_type="glb", process=False)
@@ -123,7 +130,17 @@ def _textured_glb(path: Path) -> tuple[Mesh, Any]:
     faces = np.asarray(model.faces, np.int32).reshape(-1, 3)
     corners = None if uv is None else np.asarray(uv, np.float32)[faces]
     mesh = Mesh(np.asarray(model.vertices, np.float32).reshape(-1, 3), faces, corners)
-    return mesh, getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+    picture = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+    if picture is None and _names_a_texture(path):  # trimesh passes over what Pillow cannot open
+        raise InputError("the base colour cannot be opened")
+    return mesh, None if picture is None else _pixels(picture)
+
+
+def _names_a_texture(path: Path) -> bool:
+    """By the JSON at the head of a glb."""
+    with path.open("rb") as file:
+        (length,) = struct.unpack("<12xI", file.read(16))
+        return b'"baseColorTexture"' in file.read(length + 4)
 
 
 def _texture_file(path: Path) -> Path | None:
@@ -146,18 +163,22 @@ def _texture_file(path: Path) -> Path | None:
     return textures[0] if textures else None
 
 
-def _pixels(picture: Any, path: Path) -> UInt8[np.ndarray, "rows columns 3"]:
-    from PIL import Image, UnidentifiedImageError
+def _picture_file(picture: Path, path: Path) -> UInt8[np.ndarray, "rows columns 3"]:
+    from PIL import Image
 
-    if not isinstance(picture, Path):
-        return np.array(picture.convert("RGB"))
     if not picture.is_file():
         raise InputError(f"{picture}: no such file, the texture of {path.name}")
     try:
-        with Image.open(picture) as image:
-            return np.array(image.convert("RGB"))
-    except (UnidentifiedImageError, OSError) as error:
-        raise InputError(f"{picture}: not a readable image ({_one_line(error)})") from None
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # it stops at twice that by itself
+            with Image.open(picture) as image:
+                return _pixels(image)
+    except Exception as error:  # whatever Pillow's readers meet in a damaged file
+        raise InputError(f"{picture}: not a readable image, damaged or too large ({_one_line(error)})") from None
+
+
+def _pixels(image: Any) -> UInt8[np.ndarray, "rows columns 3"]:
+    return np.array(image.convert("RGB"))
 
 
 def _glb_bytes(mesh: Mesh, colours: np.ndarray | None) -> bytes:

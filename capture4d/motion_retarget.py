@@ -139,9 +139,10 @@ def retarget(
         first_frame: where to start, in frames of the result.
         place: `origin` turns the clip to face +Z and starts it above the origin; `world` leaves it where it is.
     Raises:
-        InputError: the file's joint names follow none of the known schemes.
+        InputError: the file's joint names follow none of the known schemes, or the body's are not the built-in body's.
     """
     scheme = _match(bvh)
+    _require_joints(shaped, scheme)
     world = bvh.world_rotations()
     duration = (len(world) - 1) * bvh.frame_time_s
     at = np.arange(first_frame / fps, duration + 0.1 / fps, 1 / fps)  # files round their frame time
@@ -178,9 +179,7 @@ def as_smpl(shaped: ShapedBody, poses: PoseSequence) -> Bvh:
     """
     names = list(shaped.body.joint_names)
     scheme, tree = SCHEMES[0], list(SMPL_TREE)
-    missing = sorted(set(scheme.drives) - set(names))
-    if missing:
-        raise InputError(f"body: expected joints named as the built-in body's, found none called {missing[0]}")
+    _require_joints(shaped, scheme)
     source = Bvh(
         Path("SMPL"),
         tuple(tree),
@@ -211,6 +210,12 @@ def as_smpl(shaped: ShapedBody, poses: PoseSequence) -> Bvh:
         rotations=Rotation.from_matrix(local.reshape(-1, 3, 3)),
         root_positions=(poses.translations + shaped.joints[0]) / scale,
     )
+
+
+def _require_joints(shaped: ShapedBody, scheme: _Scheme) -> None:
+    missing = sorted(set(scheme.drives) - set(shaped.body.joint_names))
+    if missing:
+        raise InputError(f"body: expected joints named as the built-in body's, found none called {missing[0]}")
 
 
 def _world(shaped: ShapedBody, poses: PoseSequence) -> tuple[np.ndarray, np.ndarray]:

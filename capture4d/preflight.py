@@ -13,8 +13,9 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from capture4d.scan_placement import MAX_FLOOR_M, MAX_SIZE_RATIO, UNITS, Survey
+from capture4d.scan_placement import MAX_FLOOR_M, MAX_SIZE_RATIO, Survey
 from capture4d.scan_statistics import FrameStatistics, Paints, colour_angles, to_lab
+from capture4d.scans import METRES
 
 __all__ = ["CODES", "BadFrame", "Code", "Finding", "Limits", "Severity", "TakeFacts", "Verdict", "judge", "true_rate"]
 
@@ -53,7 +54,7 @@ ADVICE: Mapping[Code, tuple[Severity, str]] = {
     "axes": ("error", "export with Y up; --fix turns the scans"),
     "mirrored": ("error", "look for a left-handed axis convention in the export; --fix mirrors the scans back"),
     "winding": ("error", "reverse the faces on export; --fix does. If text reads backwards, the take is mirrored"),
-    "floor": ("warning", "put the floor at y = 0; --fix shifts the scans where the feet or motion capture tell"),
+    "floor": ("warning", "put the floor at y = 0; --fix shifts scans and poses where the feet or motion capture tell"),
     "frame-unreadable": ("error", "copy or reconstruct these frames again; --fix leaves them out"),
     "frame-empty": ("error", "reconstruct these frames again; --fix leaves them out"),
     "frame-nan": ("error", "reconstruct these frames again; --fix leaves them out"),
@@ -154,7 +155,6 @@ class TakeFacts:
     """Frame numbers with more than one file."""
     pose_frames: tuple[int, ...] | None = None
     pose_fps: float | None = None
-    has_rig: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -271,7 +271,7 @@ def _check_numbers(facts: TakeFacts) -> Iterator[Finding]:
 
 
 def _check_survey(survey: Survey, facts: TakeFacts, limits: Limits) -> Iterator[Finding]:
-    declared = next((name for name, metres in UNITS.items() if metres == facts.declared), "?")
+    declared = next((name for name, metres in METRES.items() if metres == facts.declared), "?")
     unit = f"a person in {survey.units}" if survey.units else "in no known unit a person"
     yield Finding(
         "units",

@@ -16,6 +16,7 @@ from jaxtyping import Float64
 
 from capture4d.calibration_board import BoardView
 from capture4d.colmap_model import colmap_camera, lens_of, sensor, to_colmap_pixels
+from capture4d.errors import InputError
 from capture4d.projection import project, transform
 from capture4d.pycolmap_loading import import_pycolmap
 from capture4d.types import Rig
@@ -48,7 +49,7 @@ def adjust_rig(
         loss_px: scale of Cauchy's loss; a residual far above it has next to no weight.
         free_board: solve for the shape of the board as well, all but three of its corners.
     Raises:
-        RuntimeError: Ceres found no usable solution.
+        InputError: Ceres found no usable solution.
     """
     pycolmap = import_pycolmap()
     reference = views[0].camera
@@ -72,7 +73,10 @@ def adjust_rig(
             config.add_constant_point(point_id)
     summary = pycolmap.create_default_bundle_adjuster(options, config, model).solve()
     if not summary.is_solution_usable():
-        raise RuntimeError("the bundle adjustment found no solution")
+        raise InputError(
+            "board images: expected corners that agree on one rig and one board, found no solution of the bundle "
+            "adjustment; look for mixed-up cameras or poses, and for images of another board"
+        )
     return _estimate(start, model, views, reference)
 
 

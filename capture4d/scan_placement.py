@@ -22,10 +22,10 @@ from scipy.spatial import KDTree
 from capture4d.mesh import face_areas
 from capture4d.scan_motion import CLIP_M, Motion, fit_person, fit_posed_bodies, floor_by_poses
 from capture4d.scan_statistics import outwardness
+from capture4d.scans import METRES, Units
 from capture4d.types import Mesh, Rig
 
 __all__ = [
-    "UNITS",
     "MannequinFit",
     "Placement",
     "Survey",
@@ -38,9 +38,6 @@ __all__ = [
     "survey_take",
 ]
 
-
-UNITS: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
-"""Metres in one unit."""
 SUBJECT_SIZE_M = 1.2
 """Square root of a scanned subject's surface: 0.95 m for a bare shirt, 1.5 m for a clothed person from head to toe."""
 MAX_SIZE_RATIO = 1.65
@@ -124,7 +121,7 @@ class Survey:
 
     placement: Placement
     """What brings the take to metres, Y up, faces outside, feet on the floor; only what was found to be wrong."""
-    units: str | None
+    units: Units | None
     """What the files are in, None if no unit makes the subject a person."""
     size_ratio: float
     """How many times too large or too small the subject is as declared, never below 1."""
@@ -141,6 +138,8 @@ class Survey:
     by_poses: bool
     person_ratio: float | None = None
     """How far the body that the scans show is from that of the motion capture, over what is tolerated; None without."""
+    poses_lift_m: float = 0.0
+    """What lifts the motion capture with the scans, where it shares their floor."""
     person_m: float = 0.0
     """That distance: root mean square over what was scanned."""
 
@@ -156,10 +155,10 @@ def survey_take(probes: Sequence[Mesh], declared: float, motion: Motion | None =
     size = float(np.median([np.sqrt(_area(mesh)) for mesh in probes]))
     ratio = size * declared / SUBJECT_SIZE_M
     size_ratio = max(ratio, 1 / max(ratio, 1e-12))
-    units, scale = next((name for name, metres in UNITS.items() if metres == declared), None), declared
+    units, scale = next((name for name, metres in METRES.items() if metres == declared), None), declared
     if size_ratio > MAX_SIZE_RATIO:
         units, left = find_units(size)
-        scale = UNITS[units]
+        scale = METRES[units]
         if left > MAX_SIZE_RATIO:
             units, scale = None, SUBJECT_SIZE_M / max(size, 1e-12)
     sign = float(np.median([outwardness(mesh) for mesh in probes]))
@@ -186,7 +185,10 @@ def survey_take(probes: Sequence[Mesh], declared: float, motion: Motion | None =
         ratio = person.difference_m / (MAX_PERSON_M if motion.cloth_known else MAX_PERSON_DRESSED_M)
         survey = replace(survey, person_ratio=ratio, person_m=person.difference_m)
         if ratio <= 1:
-            return _with_floor(survey, person.floor_m, exact=True)
+            survey = _with_floor(survey, person.floor_m, exact=True)
+            apart = float(person.shift[1])
+            shared = abs(apart) < abs(person.floor_m - apart)  # theirs is nearer to that of the scans than to 0
+            return replace(survey, poses_lift_m=survey.placement.lift_m if shared else 0.0)
     return _with_floor(survey, *_floor_by_feet(placed))
 
 
@@ -253,13 +255,13 @@ def sample_surface(mesh: Mesh, *, outward: bool = True, count: int = PROBE_POINT
     return np.hstack([corners[chosen].mean(axis=1), unit])
 
 
-def find_units(size: float) -> tuple[str, float]:
+def find_units(size: float) -> tuple[Units, float]:
     """The unit in which a subject of this size, the square root of its surface, is a person; and how far off it is.
 
     Returns:
         The unit, and the ratio of the size in it to that of a person, never below 1.
     """
-    ratios = {unit: size * metres / SUBJECT_SIZE_M for unit, metres in UNITS.items()}
+    ratios = {unit: size * metres / SUBJECT_SIZE_M for unit, metres in METRES.items()}
     unit = min(ratios, key=lambda name: abs(np.log(max(ratios[name], 1e-12))))
     return unit, float(np.exp(abs(np.log(max(ratios[unit], 1e-12)))))
 

@@ -10,8 +10,9 @@ import numpy as np
 
 from capture4d.body_tracking import ScanPoints
 from capture4d.body_tracking_config import SamplingConfig
+from capture4d.colours import Colour
 from capture4d.errors import InputError
-from capture4d.garment_extraction import Colour, classify_colours, settle_labels
+from capture4d.garment_extraction import classify_colours, settle_labels
 from capture4d.mesh_kernels import open_vertices, vertex_normals_kernel
 from capture4d.types import Scan
 

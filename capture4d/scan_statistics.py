@@ -15,7 +15,8 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.spatial import KDTree
 
-from capture4d.garment_extraction import FIRST_PAINT, GARMENT, OTHER, classify_colours
+from capture4d.colours import Colour
+from capture4d.garment_extraction import FIRST_PAINT, GARMENT, OTHER, classify_colours, linear_colours
 from capture4d.mesh import boundary_edges, vertex_normals
 from capture4d.mesh_kernels import open_vertices
 from capture4d.types import Mesh, Rig, Scan
@@ -34,8 +35,6 @@ __all__ = [
     "surface_shift",
     "to_lab",
 ]
-
-Colour = tuple[int, int, int]
 
 NOISE_SAMPLES, NOISE_NEIGHBOURS = 600, 12
 SHIFT_SAMPLES = 1500
@@ -325,7 +324,7 @@ def _stray_shares(mesh: Mesh, labels: np.ndarray, paints: int) -> tuple[float, .
 
 def colour_angles(colours: UInt8[np.ndarray, "n 3"], reference: Colour) -> Float64[np.ndarray, " n"]:
     """Angle between colours and a reference in linear RGB, radians; shading does not change it."""
-    light, wanted = _linear(colours), _linear(np.array([reference], np.uint8))[0]
+    light, wanted = linear_colours(colours), linear_colours(np.array([reference], np.uint8))[0]
     size = np.maximum(np.linalg.norm(light, axis=1) * np.linalg.norm(wanted), 1e-9)
     return np.arccos(np.clip(light @ wanted / size, -1, 1))
 
@@ -334,11 +333,6 @@ def to_lab(colours: UInt8[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
     """CIELAB of sRGB under D65: lightness 0 to 100, and two axes of chroma."""
     # IEC 61966-2-1 primaries, rows divided by the white point; CIE 15 for the cube roots.
     to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
-    xyz = _linear(colours) @ (to_xyz / to_xyz.sum(axis=1, keepdims=True)).T
+    xyz = linear_colours(colours) @ (to_xyz / to_xyz.sum(axis=1, keepdims=True)).T
     root = np.where(xyz > 216 / 24389, np.cbrt(xyz), (24389 / 27 * xyz + 16) / 116)
     return np.stack([116 * root[:, 1] - 16, 500 * (root[:, 0] - root[:, 1]), 200 * (root[:, 1] - root[:, 2])], axis=1)
-
-
-def _linear(colours: np.ndarray) -> np.ndarray:
-    value = colours / 255.0
-    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)

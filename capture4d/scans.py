@@ -14,7 +14,6 @@ docs/conventions.md describes every file, so that it can be written without this
 from __future__ import annotations
 
 import hashlib
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -23,6 +22,7 @@ from typing import Literal, get_args
 import numpy as np
 from jaxtyping import Float32, Int32, UInt8
 
+from capture4d.colours import Colour, format_colour, parse_colour
 from capture4d.errors import InputError
 from capture4d.mesh import boundary_loops
 from capture4d.mesh_files import MESH_SUFFIXES, read_coloured_mesh, read_mesh, write_mesh
@@ -39,7 +39,7 @@ from capture4d.records import (
     save_rig,
 )
 from capture4d.types import Body, Garment, Mesh, PoseSequence, Rig, Scan
-from capture4d.workdir import read_json, write_json, write_npz
+from capture4d.workdir import file_digest, read_json, write_json, write_npz
 
 __all__ = [
     "METRES",
@@ -48,12 +48,14 @@ __all__ = [
     "TruthFrame",
     "TruthModel",
     "Units",
+    "body_digest",
     "capture_digest",
     "format_colour",
     "load_body",
     "load_garment",
     "load_poses",
     "load_rig",
+    "motion_digest",
     "parse_colour",
     "read_body",
     "read_capture",
@@ -68,7 +70,10 @@ __all__ = [
     "save_garment",
     "save_poses",
     "save_rig",
+    "scan_digest",
     "scan_path",
+    "template_digest",
+    "template_path",
     "write_capture_description",
     "write_scan",
     "write_truth_frame",
@@ -77,12 +82,13 @@ __all__ = [
 
 _FORMAT = 1
 
-Colour = tuple[int, int, int]
-"""sRGB, 0 to 255."""
-
 Units = Literal["m", "cm", "mm", "in"]
 METRES: dict[Units, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 """Metres in a unit."""
+
+TEXTURE_SUFFIXES = (".mtl", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+"""What may lie beside the scans and colour them."""
+_END = 65_536
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -144,14 +150,6 @@ class TruthFrame:
 # --- description and scans ---------------------------------------------------------------------------------------
 
 
-def parse_colour(text: str) -> Colour:
-    """'#2f62c9' or '2f62c9' as numbers."""
-    if not isinstance(text, str) or not re.fullmatch(r"#?[0-9a-fA-F]{6}", text):
-        raise InputError(f"expected a colour such as #2f62c9, found '{text}'")
-    red, green, blue = bytes.fromhex(text.removeprefix("#"))
-    return red, green, blue
-
-
 def _optional_colour(text: str | None) -> Colour | None:
     return None if text is None else parse_colour(text)
 
@@ -161,10 +159,6 @@ def _parse_units(text: str) -> Units:
         if text == units:
             return units
     raise InputError(f"expected units {', '.join(get_args(Units))}, found '{text}'")
-
-
-def format_colour(colour: Colour) -> str:
-    return "#{:02x}{:02x}{:02x}".format(*colour)
 
 
 def read_capture(path: str | Path, *, scans: bool = True) -> Capture:
@@ -259,17 +253,53 @@ def write_scan(path: str | Path, scan: Scan) -> None:
     write_mesh(path, scan.mesh, colours=scan.colours)
 
 
-def capture_digest(capture: Capture) -> str:
-    """Digest of what a stage reads from a capture: the small files whole, the scans by name and size."""
-    total = hashlib.sha256()
-    for name in ("capture.json", "poses.npz", "body.npz", "template.npz", "template.obj"):
-        path = capture.path / name
-        if path.is_file():
-            total.update(f"{name} {hashlib.sha256(path.read_bytes()).hexdigest()}\n".encode())
+def capture_digest(capture: Capture, *, instead: Mapping[int, str] | None = None) -> str:
+    """Digest of the description and the scans, which every stage starts from.
+
+    Args:
+        instead: digests of scans to count instead of those that are there now, by frame.
+    """
+    total = hashlib.sha256((capture.path / "capture.json").read_bytes())
     for frame_id in capture.frame_ids:
-        path = scan_path(capture, frame_id)
-        total.update(f"{path.name} {path.stat().st_size}\n".encode())
+        digest = (instead or {}).get(frame_id) or scan_digest(scan_path(capture, frame_id))
+        total.update(f"{frame_id} {digest}\n".encode())
+    for path in sorted((capture.path / "scans").iterdir()):
+        if path.suffix.lower() in TEXTURE_SUFFIXES:
+            total.update(f"{path.name} {scan_digest(path)}\n".encode())
     return total.hexdigest()
+
+
+def scan_digest(path: Path) -> str:
+    """Digest of a scan or its texture: name, size, first and last 64 kB, for takes are too large to be read twice."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        total = hashlib.sha256(f"{path.name} {size}\n".encode() + file.read(_END))
+        file.seek(max(size - _END, _END))
+        total.update(file.read(_END))
+    return total.hexdigest()
+
+
+def template_digest(capture: Capture) -> str:
+    """Digest of the template.
+
+    Raises:
+        InputError: there is none.
+    """
+    return file_digest([template_path(capture)], root=capture.path)
+
+
+def body_digest(capture: Capture) -> str | None:
+    """Digest of the body; None where the capture brings none."""
+    path = capture.path / "body.npz"
+    return file_digest([path], root=capture.path) if path.is_file() else None
+
+
+def motion_digest(capture: Capture) -> str | None:
+    """Digest of the poses and of the body they move; None where the capture brings no poses."""
+    if not (capture.path / "poses.npz").is_file():
+        return None
+    paths = [capture.path / name for name in ("poses.npz", "body.npz")]
+    return file_digest([path for path in paths if path.is_file()], root=capture.path)
 
 
 def _scan_numbers(path: Path) -> set[int]:
@@ -318,24 +348,34 @@ def read_rig(capture: Capture) -> Rig | None:
     return load_rig(path) if path.is_file() else None
 
 
+def template_path(capture: Capture) -> Path:
+    """The file of the template.
+
+    Raises:
+        InputError: there is none.
+    """
+    for suffix in (".npz", *MESH_SUFFIXES):
+        path = capture.path / f"template{suffix}"
+        if path.is_file():
+            return path
+    raise InputError(
+        f"{capture.path / 'template.npz'}: no such file, nor a template.obj; registration needs a template"
+    )
+
+
 def read_template(capture: Capture) -> Garment:
     """The garment to register: `template.npz`, or a bare mesh `template.obj` with loops called border_0, border_1, ...
 
     Raises:
         InputError: there is neither.
     """
-    if (capture.path / "template.npz").is_file():
-        return load_garment(capture.path / "template.npz")
-    for suffix in MESH_SUFFIXES:
-        path = capture.path / f"template{suffix}"
-        if path.is_file():
-            mesh = read_mesh(path).mesh
-            if capture.units != "m":
-                mesh = mesh.with_vertices(mesh.vertices * np.float32(METRES[capture.units]))
-            return Garment(mesh, {f"border_{index}": loop for index, loop in enumerate(boundary_loops(mesh.faces))})
-    raise InputError(
-        f"{capture.path / 'template.npz'}: no such file, nor a template.obj; registration needs a template"
-    )
+    path = template_path(capture)
+    if path.suffix == ".npz":
+        return load_garment(path)
+    mesh = read_mesh(path).mesh
+    if capture.units != "m":
+        mesh = mesh.with_vertices(mesh.vertices * np.float32(METRES[capture.units]))
+    return Garment(mesh, {f"border_{index}": loop for index, loop in enumerate(boundary_loops(mesh.faces))})
 
 
 # --- truth -------------------------------------------------------------------------------------------------------

@@ -20,7 +20,7 @@ from capture4d.garment_extraction import extract_garment
 from capture4d.scans import Capture, Colour, read_capture, read_scan, read_template
 from capture4d.types import GarmentScan, Scan
 
-__all__ = ["KnownColours", "cut_out", "take_colours"]
+__all__ = ["KnownColours", "cut_out", "forget_learned_colours", "take_colours", "template_loops"]
 
 FRAMES = 4
 """Scans that colours are learned from."""
@@ -58,6 +58,11 @@ def take_colours(capture: Capture, *, learn: bool = False) -> KnownColours:
     return _learned(capture.path.resolve(), capture.garment_colour, tuple(capture.boundary_colours.items()))
 
 
+def forget_learned_colours() -> None:
+    """Learn anew when next asked: the files of a take may have changed since. A stage does this once, as it begins."""
+    _learned.cache_clear()
+
+
 @lru_cache(maxsize=1)
 def _learned(path: Path, garment: Colour | None, boundary: tuple[tuple[str, Colour], ...]) -> KnownColours:
     capture = read_capture(path)
@@ -67,7 +72,7 @@ def _learned(path: Path, garment: Colour | None, boundary: tuple[tuple[str, Colo
         as_seen = dict(zip(paints, found.paints, strict=True))
         named = {name: as_seen[colour] for name, colour in boundary}
         return KnownColours(found.garment, named, tuple(named), found.others, found.light)
-    names = _template_loops(capture)
+    names = template_loops(capture)
     if len(found.paints) == 1:
         named = dict.fromkeys(names or ("border",), found.paints[0])
     else:
@@ -100,7 +105,8 @@ def _some_scans(capture: Capture) -> list[Scan]:
     return scans
 
 
-def _template_loops(capture: Capture) -> tuple[str, ...]:
+def template_loops(capture: Capture) -> tuple[str, ...]:
+    """Names of the template's borders, which name what is learned; none without a template."""
     try:
         return tuple(read_template(capture).loops)
     except InputError:
@@ -116,7 +122,7 @@ def cut_out(scan: Scan, colours: KnownColours, *, source: str = "scan") -> Garme
     garment = extract_garment(
         colours.flat(scan), colours.garment, colours.boundary, other_colours=colours.others, source=source
     )
-    if colours.light is None:
+    if colours.light is None and (garment.boundary_loops >= 0).any():
         return garment
     if colours.loop_names != garment.loop_names:
         unknown = np.full(len(garment.boundary_points), -1, np.int32)

@@ -172,6 +172,10 @@ class Body:
         _require_array("Body", "joint_directions", self.joint_directions, (shapes, joints, 3), np.float32)
         _require_array("Body", "parents", self.parents, (joints,), np.int32)
         _require_array("Body", "skin_weights", self.skin_weights, (verts, joints), np.float32)
+        for name in ("shape_directions", "joints", "joint_directions", "skin_weights"):
+            _require_finite("Body", name, getattr(self, name))
+        if self.pose_directions is not None:
+            _require_finite("Body", "pose_directions", self.pose_directions)
         if self.parents[0] != -1 or (self.parents[1:] >= np.arange(1, joints)).any() or (self.parents[1:] < 0).any():
             raise InputError("Body.parents: expected joint 0 as the root and every parent before its children")
         if np.abs(self.skin_weights.sum(axis=1) - 1).max(initial=0) > 1e-3:
@@ -202,6 +206,7 @@ class PoseSequence:
         _require_array("PoseSequence", "frame_ids", self.frame_ids, (frames,), np.int32)
         _require_finite("PoseSequence", "rotations", self.rotations)
         _require_finite("PoseSequence", "translations", self.translations)
+        _require_finite("PoseSequence", "shape", self.shape)
         if not self.fps > 0:
             raise InputError(f"PoseSequence.fps: expected a positive frame rate, found {self.fps}")
         if len(np.unique(self.frame_ids)) != frames:
@@ -239,6 +244,7 @@ class Garment:
             _require_finite("Garment", "body_shape", self.body_shape)
         if self.skin_weights is not None:
             _require_array("Garment", "skin_weights", self.skin_weights, (verts, None), np.float32)
+            _require_finite("Garment", "skin_weights", self.skin_weights)
             if np.abs(self.skin_weights.sum(axis=1) - 1).max(initial=0) > 1e-3:
                 raise InputError("Garment.skin_weights: expected rows that sum to 1")
 

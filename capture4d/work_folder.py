@@ -26,6 +26,7 @@ __all__ = [
     "REGISTER",
     "VERDICTS",
     "capture_path",
+    "captured_motion",
     "failed_frames",
     "is_animated",
     "load_moving_body",
@@ -126,6 +127,16 @@ def work_capture(work: Path) -> Capture:
     return read_capture(capture_path(work))
 
 
+def captured_motion(capture: Capture) -> tuple[Body | None, PoseSequence | None]:
+    """The body and the poses that a capture brings; the built-in body where poses come without one.
+
+    Raises:
+        InputError: a scan has no pose.
+    """
+    body, poses = read_body(capture), read_poses(capture)
+    return (load_anny() if body is None and poses is not None else body), poses
+
+
 def load_moving_body(work: Path) -> tuple[Body, PoseSequence]:
     """The body and the poses with which a take was registered: those that were tracked, or those of its capture.
 
@@ -136,7 +147,7 @@ def load_moving_body(work: Path) -> tuple[Body, PoseSequence]:
     if "body" in upstream or is_animated(work):
         return load_tracking(work / "body")
     capture = read_capture(capture_path(work))
-    poses = read_poses(capture)
-    if poses is None:
+    body, poses = captured_motion(capture)
+    if body is None or poses is None:
         raise InputError(f"{work}: expected poses in {capture.path}, found none; track the body and register again")
-    return read_body(capture) or load_anny(), poses
+    return body, poses

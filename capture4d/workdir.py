@@ -174,6 +174,13 @@ class Stage:
 
     path: Path
     _record: dict[str, Any]
+    _earlier: dict[str, Any] | None = None
+    """Record of the run before, if that was complete."""
+
+    @property
+    def was_complete(self) -> bool:
+        """An earlier run with these settings and inputs has finished."""
+        return self._earlier is not None
 
     @property
     def frames_folder(self) -> Path:
@@ -187,11 +194,27 @@ class Stage:
         """The frames that have no valid file yet, in the order given."""
         return [frame_id for frame_id in frame_ids if not _is_whole(self.frame_path(frame_id, suffix, folder=folder))]
 
-    def finish(self, paths: Iterable[Path]) -> str:
+    def count(self, suffix: str = ".npz", *, folder: str = "frames") -> int:
+        """How many frames have a file, whole or not: cheap enough to be asked every second."""
+        try:
+            with os.scandir(self.path / folder) as entries:
+                return sum(entry.name.endswith(suffix) and not entry.name.startswith(".") for entry in entries)
+        except FileNotFoundError:
+            return 0
+
+    def finish(self, paths: Iterable[Path], *, changed: bool = True) -> str:
         """Mark the stage complete and return its digest, over the names and contents of `paths`.
 
         Leave out of `paths` what differs between equal runs, such as times.
+
+        Args:
+            changed: False if nothing was written since the stage was opened: if it was complete then, its digest is
+                not computed again.
         """
+        paths = list(paths)
+        if self._earlier is not None and not changed and all(path.is_file() for path in paths):
+            write_json(self.path / "stage.json", {**self._earlier, "sources": self._record["sources"]})
+            return self._earlier["digest"]
         for leftover in self.path.rglob(f".*{_TEMPORARY_SUFFIX}"):
             leftover.unlink(missing_ok=True)
         digest = file_digest(paths, root=self.path)
@@ -208,6 +231,7 @@ def open_stage(
     config: Any,
     upstream: Mapping[str, str],
     sources: Mapping[str, Path] | None = None,
+    formerly: Mapping[str, str] | None = None,
     overwrite: bool = False,
 ) -> Stage:
     """Open an output folder, new or to be continued.
@@ -218,6 +242,7 @@ def open_stage(
         config: frozen dataclass of everything that decides the result (so not the number of workers).
         upstream: digest of each input, by name.
         sources: where the inputs lie, for later stages and for people. Inputs may be moved, so this decides nothing.
+        formerly: an earlier `upstream` whose results still hold; a folder that was made from it is taken over.
         overwrite: start clean; deletes everything in the folder, if it is this stage's.
     Raises:
         InputError: the folder holds something else, or this stage made with other settings or from other inputs.
@@ -241,6 +266,8 @@ def open_stage(
     if existing is not None and (overwrite or existing.get("status") == "discarded"):
         _discard(folder, existing)
         existing = None
+    if existing is not None and formerly not in (None, upstream) and existing.get("upstream") == formerly:
+        existing = {**existing, "upstream": settings["upstream"], "status": "taken over"}
     if existing is not None:
         changed = list(_differences(settings, existing))
         if changed:
@@ -252,14 +279,17 @@ def open_stage(
     record = {**settings, "sources": places, "status": "running", "started": started}
     if existing is None or existing.get("status") != "running":
         write_json(record_path, record)
-    return Stage(folder, record)
+    return Stage(folder, record, existing if existing and existing.get("status") == "complete" else None)
 
 
-def require_complete(folder: str | Path, name: str, command: str) -> str:
+def require_complete(folder: str | Path, name: str, command: str, *, made_from: Mapping[str, str] | None = None) -> str:
     """The digest of a finished stage.
 
+    Args:
+        made_from: digests of inputs that it has to have been made from, by name.
     Raises:
-        InputError: it is missing or unfinished; the message names `command`, which repairs that.
+        InputError: it is missing, unfinished, or made from something else; the message names `command`, which repairs
+            that.
     """
     folder = Path(folder)
     if not (folder / "stage.json").is_file():
@@ -269,6 +299,12 @@ def require_complete(folder: str | Path, name: str, command: str) -> str:
         raise InputError(f"{folder}: expected the output of '{name}', found output of '{record.get('stage')}'")
     if record.get("status") != "complete":
         raise InputError(f"{folder}: '{name}' is not finished; run: {command}")
+    for key, digest in (made_from or {}).items():
+        if record.get("upstream", {}).get(key) != digest:
+            raise InputError(
+                f"{folder}: expected the output of '{name}' from this {key} as it is now, found that of another or of "
+                f"an earlier state; run: {command} --overwrite"
+            )
     return record["digest"]
 
 

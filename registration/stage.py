@@ -22,9 +22,17 @@ from capture4d.body_stage import load_tracking, tracking_digest
 from capture4d.errors import InputError
 from capture4d.garment_binding import with_body_shape
 from capture4d.garment_stage import load_garment_scan
-from capture4d.scans import Capture, read_body, read_capture, read_poses, read_template, save_garment
+from capture4d.scans import (
+    Capture,
+    capture_digest,
+    motion_digest,
+    read_capture,
+    read_template,
+    save_garment,
+    template_digest,
+)
 from capture4d.types import Body, Garment, PoseSequence
-from capture4d.work_folder import REGISTER, VERDICTS, stack_vertices
+from capture4d.work_folder import REGISTER, VERDICTS, captured_motion, stack_vertices
 from capture4d.workdir import (
     Stage,
     open_stage,
@@ -41,7 +49,7 @@ from registration.template import TemplateAnalysis, analyse_template
 
 __all__ = ["run"]
 
-SCHEMA = 1
+SCHEMA = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,13 +78,20 @@ def run(
     Args:
         body_folder: tracked body to move the template with; None takes the poses that the capture brings.
     Raises:
-        InputError: the capture or the garments are missing or unfinished, or poses, body and template disagree.
+        InputError: the capture or the garments are missing or unfinished, the garments are those of another capture, or
+            poses, body and template disagree.
     """
     description = read_capture(capture)
     command = f"capture4d extract {capture} --output {output.parent}"
-    upstream = {"garment": require_complete(garment_folder, "extract", command)}
+    made_from = {"capture": capture_digest(description)}
+    upstream = {
+        "garment": require_complete(garment_folder, "extract", command, made_from=made_from),
+        "template": template_digest(description),
+    }
     if body_folder is not None:
         upstream["body"] = tracking_digest(body_folder, capture)
+    elif digest := motion_digest(description):
+        upstream["motion"] = digest
     stage = open_stage(output, name=REGISTER, schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite)
     _analysis.cache_clear()
     garment = _template(description, body_folder)
@@ -94,16 +109,21 @@ def run(
     ]
     for _ in run_jobs(
         partial(_register_job, config), jobs, workers=workers, label="register", units=lambda job: len(job.positions),
-        finished=lambda: len(frame_ids) - len(stage.pending(frame_ids)),
+        finished=stage.count,
     ):  # fmt: skip
         pass
-    return _collect(stage, description.frame_ids)
+    gathered = all((output / name).is_file() for name in ("vertices.npy", "metrics.jsonl"))
+    changed = bool(pending) or not gathered or not stage.was_complete
+    if changed:
+        _gather(stage, frame_ids)
+    frames = [stage.frame_path(frame_id) for frame_id in frame_ids]
+    return stage.finish([output / "garment.npz", output / "vertices.npy", *frames], changed=changed)
 
 
 def _moving(capture: Capture, body_folder: Path | None) -> tuple[Body | None, PoseSequence | None]:
     """The body and its poses: those that were tracked, or those of the capture."""
     if body_folder is None:
-        return read_body(capture), read_poses(capture)
+        return captured_motion(capture)
     return load_tracking(body_folder)
 
 
@@ -181,10 +201,8 @@ def _metrics_path(stage: Stage, frame_id: int) -> Path:
     return stage.frame_path(frame_id, ".json", folder="metrics")
 
 
-def _collect(stage: Stage, frame_ids: tuple[int, ...]) -> str:
-    """Stack the frames, gather the metrics, close the stage."""
+def _gather(stage: Stage, frame_ids: tuple[int, ...]) -> None:
+    """Stack the frames and their metrics."""
     stack_vertices(stage, frame_ids)
     lines = [json.dumps(read_json(_metrics_path(stage, frame_id))) for frame_id in frame_ids]
     write_bytes(stage.path / "metrics.jsonl", ("\n".join(lines) + "\n").encode())
-    frames = [stage.frame_path(frame_id) for frame_id in frame_ids]
-    return stage.finish([stage.path / "garment.npz", stage.path / "vertices.npy", *frames])

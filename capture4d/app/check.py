@@ -71,6 +71,8 @@ class _Job:
     rig: Rig | None
     poses_path: Path | None
     body_path: Path | None
+    """None is the built-in body."""
+    poses_lift_m: float
 
 
 def check_take(path: Path, claims: Claims | None = None, *, all_frames: bool = False, workers: int = 1) -> Checked:
@@ -90,7 +92,7 @@ def check_take(path: Path, claims: Claims | None = None, *, all_frames: bool = F
     bad: list[BadFrame] = []
     for statistics, unreadable in run_jobs(
         _measure_run,
-        _jobs(take, chosen, placement, rig),
+        _jobs(take, chosen, placement, rig, 0.0 if survey is None else survey.poses_lift_m),
         workers=workers,
         label="Checking",
         units=lambda job: len(job.files),
@@ -110,9 +112,8 @@ def check_take(path: Path, claims: Claims | None = None, *, all_frames: bool = F
 
 def _survey(take: TakeFolder) -> Survey | None:
     """Coordinates from the first readable frames of equal parts of the take."""
-    posed = take.facts.pose_frames
-    has_body = take.poses_path is not None and take.body_path is not None
-    known = [number for number in take.files if not (has_body and posed) or number in set(posed or ())]
+    posed = set(take.facts.pose_frames or ()) if take.moving else set()
+    known = [number for number in take.files if not posed or number in posed]
     candidates = known or list(take.files)
     probes: list[tuple[int, MeshFile]] = []
     for part in np.array_split(np.array(candidates), min(PROBES, len(candidates))):
@@ -128,7 +129,7 @@ def _survey(take: TakeFolder) -> Survey | None:
 
 def _motion(take: TakeFolder, probes: Sequence[tuple[int, MeshFile]]) -> Motion | None:
     """Motion capture in the probe frames, and what of them is not the garment."""
-    if take.poses_path is None or take.body_path is None:
+    if take.poses_path is None or not take.moving:
         return None
     states = [body_state(take.poses_path, take.body_path, number) for number, _ in probes]
     posed = [state for state in states if state is not None]
@@ -187,7 +188,9 @@ def _sample(take: TakeFolder) -> list[int]:
     return [numbers[index] for index in sorted(chosen)]
 
 
-def _jobs(take: TakeFolder, chosen: Sequence[int], placement: Placement, rig: Rig | None) -> list[_Job]:
+def _jobs(
+    take: TakeFolder, chosen: Sequence[int], placement: Placement, rig: Rig | None, poses_lift_m: float
+) -> list[_Job]:
     """Runs of consecutive frames; each knows the frame before it, so that where runs end does not matter."""
     index = {number: place for place, number in enumerate(take.files)}
     numbers = list(take.files)
@@ -208,8 +211,9 @@ def _jobs(take: TakeFolder, chosen: Sequence[int], placement: Placement, rig: Ri
                 placement=placement,
                 paints=take.facts.paints,
                 rig=rig,
-                poses_path=take.poses_path if take.body_path else None,
+                poses_path=take.poses_path if take.moving else None,
                 body_path=take.body_path,
+                poses_lift_m=poses_lift_m,
             )
         )
     return jobs
@@ -236,8 +240,10 @@ def _measure_run(job: _Job) -> tuple[list[FrameStatistics], list[BadFrame]]:
         filler = np.zeros((len(mesh.vertices), 3), np.uint8)
         scan = Scan(mesh, filler if colours is None else colours, number, 0.0)
         body = None
-        if job.poses_path is not None and job.body_path is not None:
+        if job.poses_path is not None:
             body = posed_body(job.poses_path, job.body_path, number)
+        if body is not None:
+            body = body + np.array([0, job.poses_lift_m, 0])
         frame = measure_frame(scan, job.paints, rig=job.rig, body=body, has_colours=colours is not None)
         frame = replace(frame, time_s=time_stamp(file))
         if before is not None:

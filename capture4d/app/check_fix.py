@@ -1,6 +1,7 @@
 """`capture4d check --fix`: the take again, without what is safely repaired. The original is only read.
 
-Scans are rewritten in metres, Y up, faces outside, feet on the floor; frames that cannot be used are left out and named
+Scans, and a bare template, are rewritten in metres, Y up, faces outside, feet on the floor; poses move along if they
+share the floor; frames that cannot be used are left out and named
 in capture.json as dropped. Frame numbers stay: a frame's time follows from its number. What needs a person's judgement
 (paint, light, calibration, other people's poses) stays as it is.
 """
@@ -8,7 +9,7 @@ in capture.json as dropped. Frame numbers stay: a frame's time follows from its 
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,11 @@ from capture4d.app.check_take import TakeFolder, read_frame
 from capture4d.errors import InputError
 from capture4d.mesh_files import MESH_SUFFIXES, read_mesh, write_mesh
 from capture4d.preflight import BadFrame
-from capture4d.records import save_rig
+from capture4d.records import load_poses, save_poses, save_rig
 from capture4d.scan_placement import Placement, place, place_rig
+from capture4d.scan_statistics import outwardness
+from capture4d.scans import Capture, format_colour, parse_colour
+from capture4d.take_colours import template_loops
 from capture4d.workdir import run_jobs, write_json
 
 __all__ = ["fixed_path", "write_fixed"]
@@ -38,11 +42,12 @@ class _Job:
 
 
 def fixed_path(capture: Path) -> Path:
-    return capture.parent / f"{capture.resolve().name}-fixed"
+    capture = capture.resolve()
+    return capture.parent / f"{capture.name}-fixed"
 
 
 def write_fixed(checked: Checked, *, workers: int = 1) -> Path:
-    """Write the corrected take next to the original; the new folder.
+    """Write the corrected take next to the original; the new folder. It is there whole or not at all.
 
     Raises:
         InputError: the folder exists, or no frame is left.
@@ -53,14 +58,19 @@ def write_fixed(checked: Checked, *, workers: int = 1) -> Path:
     if checked.survey is None:
         raise InputError(f"{take.path}: no readable frame, nothing to correct")
     placement = checked.survey.placement
-    kept = [number for number in take.files if number not in _unusable(checked)]
+    unusable = _unusable(checked)
+    kept = [number for number in take.files if number not in unusable]
     if not kept:
         raise InputError(f"{take.path}: no usable frame, nothing to correct")
-    (output / "scans").mkdir(parents=True)
-    jobs = [_Job(n, take.files[n], output / "scans" / f"{n:06d}.ply", placement) for n in kept]
+    partial = output.with_name(f".{output.name}.partial")
+    if partial.exists():  # of a run that was killed
+        shutil.rmtree(partial)
+    (partial / "scans").mkdir(parents=True)
+    jobs = [_Job(n, take.files[n], partial / "scans" / f"{n:06d}.ply", placement) for n in kept]
     written = sorted(number for number in run_jobs(_rewrite, jobs, workers=workers, label="Correcting") if number >= 0)
-    _copy_companions(checked, output)
-    write_json(output / "capture.json", _description(checked, written))
+    _copy_companions(checked, partial)
+    write_json(partial / "capture.json", _description(checked, written, partial))
+    partial.rename(output)
     return output
 
 
@@ -99,31 +109,37 @@ def _rewrite(job: _Job) -> int:
 
 
 def _copy_companions(checked: Checked, output: Path) -> None:
-    """Motion capture, template and rig; a rig, or a bare template, moves as the scans it belongs to."""
+    """Motion capture, template and rig; a rig, poses, or a bare template, move as the scans they belong to."""
     take = checked.take
     assert checked.survey is not None
     placement = checked.survey.placement
-    for source, name in (
-        (take.poses_path, "poses.npz"),
-        (take.body_path, "body.npz"),
-        (take.path / "template.npz", "template.npz"),
-    ):
+    for source, name in ((take.body_path, "body.npz"), (take.path / "template.npz", "template.npz")):
         if source is not None and source.is_file():
             shutil.copyfile(source, output / name)
+    if take.poses_path is not None:
+        poses, lift = load_poses(take.poses_path), np.array([0, checked.survey.poses_lift_m, 0], np.float32)
+        save_poses(output / "poses.npz", replace(poses, translations=poses.translations + lift))
     for suffix in MESH_SUFFIXES:
         bare = take.path / f"template{suffix}"
         if bare.is_file():
             found = read_mesh(bare)
-            sized = found.mesh.with_vertices(found.mesh.vertices * np.float32(placement.scale))
-            write_mesh(output / bare.name, sized, colours=found.colours, polygon_sizes=found.polygon_sizes)
+            # Whichever way the faces of the scans wind, its own have to look outwards in the end.
+            own = replace(placement, flip=(outwardness(found.mesh) < 0) != placement.mirrors)
+            sizes = None if own.flip else found.polygon_sizes
+            write_mesh(output / bare.name, place(found.mesh, own), colours=found.colours, polygon_sizes=sizes)
     if take.rig is not None:
         factor = placement.scale / take.facts.declared
         save_rig(output / "rig.json", place_rig(take.rig, placement, scale=factor) if checked.rig_moves else take.rig)
 
 
-def _description(checked: Checked, written: list[int]) -> dict[str, Any]:
+def _description(checked: Checked, written: list[int], output: Path) -> dict[str, Any]:
+    """What capture.json said, with what the command line said over it."""
     take = checked.take
     description = {"format": 1, "name": take.path.resolve().name, **take.description, "units": "m", "frames": written}
+    if take.claims.garment_colour:
+        description["garment_colour"] = format_colour(parse_colour(take.claims.garment_colour))
+    if take.claims.border_colours:
+        description["boundary_colours"] = _named_borders(take, output, written)
     fps = take.facts.fps
     if any(finding.code == "fps" for finding in checked.verdict.findings) and checked.rate is not None:
         fps = checked.rate
@@ -132,3 +148,17 @@ def _description(checked: Checked, written: list[int]) -> dict[str, Any]:
     missing = next((f.frames for f in checked.verdict.findings if f.code == "frames-missing"), ())
     dropped = {*take.facts.dropped, *missing, *take.files} - set(written)
     return {**description, "dropped_frames": sorted(dropped)}
+
+
+def _named_borders(take: TakeFolder, output: Path, written: list[int]) -> dict[str, str]:
+    """Colours of the borders that the command line gives, by the names that they have, or else as learned ones get."""
+    given = list(dict.fromkeys(format_colour(parse_colour(colour)) for colour in take.claims.border_colours))
+    described = {
+        name: format_colour(parse_colour(colour))
+        for name, colour in take.description.get("boundary_colours", {}).items()
+    }
+    if set(described.values()) == set(given):
+        return described
+    if len(given) == 1:
+        return dict.fromkeys(template_loops(Capture(output, "", 1.0, tuple(written), None)) or ("border",), given[0])
+    return {f"paint_{index}": colour for index, colour in enumerate(given)}

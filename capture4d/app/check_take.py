@@ -15,15 +15,15 @@ from typing import Any
 import numpy as np
 
 from capture4d.body import ShapedBody, pose_frame, with_shape
+from capture4d.body_anny import load_anny
 from capture4d.body_tracking_jacobian import BodyState, TrackedBody, tracked_body
 from capture4d.errors import EmptyMeshError, InputError, NotFiniteError
 from capture4d.mesh_files import MESH_SUFFIXES, read_coloured_mesh
 from capture4d.polygons import MeshFile
 from capture4d.preflight import BadFrame, TakeFacts
 from capture4d.records import load_body, load_poses, load_rig
-from capture4d.scan_placement import UNITS
 from capture4d.scan_statistics import Paints
-from capture4d.scans import parse_colour
+from capture4d.scans import METRES, parse_colour
 from capture4d.types import PoseSequence, Rig
 from capture4d.workdir import read_json
 
@@ -62,6 +62,10 @@ class TakeFolder:
     rig: Rig | None
     poses_path: Path | None
     body_path: Path | None
+    """None with `moving`: the built-in body."""
+    moving: bool
+    """There are poses, of a body that is known."""
+    claims: Claims
 
 
 def open_take(path: Path, claims: Claims | None = None) -> TakeFolder:
@@ -91,14 +95,15 @@ def open_take(path: Path, claims: Claims | None = None) -> TakeFolder:
     rig = load_rig(rig_path) if rig_path else None
     poses = load_poses(poses_path) if poses_path else None
     try:
-        facts = _facts(description, claims, tuple(files), poses, rig)
+        facts = _facts(description, claims, tuple(files), poses)
     except InputError as error:
         raise InputError(f"{described}: {error}") from None
     except (AttributeError, TypeError, ValueError) as error:
         raise InputError(f"{described}: {error}") from None
     also = {number: tuple(names[1:]) for number, names in sorted(found.items()) if len(names) > 1}
     facts = replace(facts, duplicated=tuple(also))
-    return TakeFolder(path, files, also, description, facts, rig, poses_path, body_path)
+    moving = poses is not None and (body_path is not None or poses.joint_names == load_anny().joint_names)
+    return TakeFolder(path, files, also, description, facts, rig, poses_path, body_path, moving, claims)
 
 
 def _kind(path: Path) -> str:
@@ -128,11 +133,11 @@ def _facts(
     claims: Claims,
     frame_ids: tuple[int, ...],
     poses: PoseSequence | None,
-    rig: Rig | None,
 ) -> TakeFacts:
     units = claims.units or description.get("units", "m")
-    if units not in UNITS:
-        raise InputError(f"units: expected one of {', '.join(UNITS)}, found '{units}'")
+    declared = next((metres for name, metres in METRES.items() if name == units), None)
+    if declared is None:
+        raise InputError(f"units: expected one of {', '.join(METRES)}, found '{units}'")
     fps = claims.fps if claims.fps is not None else description.get("fps")
     if fps is not None and not float(fps) > 0:
         raise InputError(f"fps: expected a positive frame rate, found {fps}")
@@ -146,7 +151,7 @@ def _facts(
     listed = description.get("frames")
     return TakeFacts(
         fps=None if fps is None else float(fps),
-        declared=UNITS[units],
+        declared=declared,
         paints=Paints(parse_colour(garment) if garment else None, tuple(parse_colour(colour) for colour in borders)),
         border_names=tuple(tuple(names) for names in borders.values()),
         frame_ids=frame_ids,
@@ -154,7 +159,6 @@ def _facts(
         dropped=tuple(int(number) for number in description.get("dropped_frames", ())),
         pose_frames=None if poses is None else tuple(int(number) for number in poses.frame_ids),
         pose_fps=None if poses is None else poses.fps,
-        has_rig=rig is not None,
     )
 
 
@@ -180,12 +184,17 @@ def time_stamp(path: Path) -> float | None:
     """Seconds, from a comment such as `comment timestamp 12.345` in the head of a ply or obj file."""
     with path.open("rb") as file:
         match = _STAMP.search(file.read(2048))
-    return float(match[1]) if match else None
+    try:
+        return float(match[1]) if match else None
+    except ValueError:  # a date, say
+        return None
 
 
-def posed_body(poses_path: Path, body_path: Path, frame_id: int) -> np.ndarray | None:
+def posed_body(poses_path: Path, body_path: Path | None, frame_id: int) -> np.ndarray | None:
     """Body surface of a frame, (V, 3), metres; None without a pose for it.
 
+    Args:
+        body_path: None is the built-in body.
     Raises:
         InputError: body and poses do not belong together.
     """
@@ -193,7 +202,7 @@ def posed_body(poses_path: Path, body_path: Path, frame_id: int) -> np.ndarray |
     return pose_frame(shaped, poses, rows[frame_id]).vertices() if frame_id in rows else None
 
 
-def body_state(poses_path: Path, body_path: Path, frame_id: int) -> BodyState | None:
+def body_state(poses_path: Path, body_path: Path | None, frame_id: int) -> BodyState | None:
     """Pose and shape of a frame; None without a pose for it."""
     shaped, poses, rows = _motion(poses_path, body_path)
     if frame_id not in rows:
@@ -204,14 +213,15 @@ def body_state(poses_path: Path, body_path: Path, frame_id: int) -> BodyState | 
     return BodyState(poses.rotations[row].astype(np.float64), poses.translations[row].astype(np.float64), shape)
 
 
-def tracked_model(poses_path: Path, body_path: Path) -> TrackedBody:
+def tracked_model(poses_path: Path, body_path: Path | None) -> TrackedBody:
     """The body of the motion capture, as tracking has it."""
     return tracked_body(_motion(poses_path, body_path)[0].body)
 
 
 @lru_cache(maxsize=1)
-def _motion(poses_path: Path, body_path: Path) -> tuple[ShapedBody, PoseSequence, dict[int, int]]:
-    body, poses = load_body(body_path), load_poses(poses_path)
+def _motion(poses_path: Path, body_path: Path | None) -> tuple[ShapedBody, PoseSequence, dict[int, int]]:
+    body, poses = load_body(body_path) if body_path else load_anny(), load_poses(poses_path)
     if body.joint_names != poses.joint_names:
-        raise InputError(f"{poses_path}: expected the joints of {body_path.name}, found others")
+        name = body_path.name if body_path else "the built-in body"
+        raise InputError(f"{poses_path}: expected the joints of {name}, found others")
     return with_shape(body, poses.shape), poses, {int(number): row for row, number in enumerate(poses.frame_ids)}

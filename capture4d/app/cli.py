@@ -33,6 +33,7 @@ __all__ = ["main"]
 _DISK_ANSWERS = {
     errno.EACCES,
     errno.EDQUOT,
+    errno.EEXIST,
     errno.EISDIR,
     errno.ENOENT,
     errno.ENOSPC,

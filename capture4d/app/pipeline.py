@@ -73,8 +73,13 @@ def run_stages(
 ) -> None:
     """The same without the report."""
     from capture4d.garment_stage import run as extract
+    from capture4d.scans import read_capture, read_poses, read_template
     from registration.stage import run as register
 
+    description = read_capture(capture)
+    read_template(description)  # what is wrong with it is said before the work, not after
+    if not track:
+        read_poses(description)
     extract(capture, output / "garment", workers=workers, overwrite=overwrite)
     body_folder = None
     if track or needs_tracking(capture):

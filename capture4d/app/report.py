@@ -20,10 +20,10 @@ import numpy as np
 
 from capture4d.app.charts import Line, line_chart
 from capture4d.app.report_metrics import METRICS, column, summarise, truth_measures
-from capture4d.app.report_pictures import Framing, Panel, colour_bar, draw_frame
+from capture4d.app.report_pictures import Framing, Panel, colour_bar, draw_frame, readable_scan
 from capture4d.app.report_stages import Calibration, StagePictures, Tracking, calibration, draw_stages, tracking
 from capture4d.evaluation import correspondence_errors, material_points
-from capture4d.scans import Capture, TruthModel, read_capture, read_scan, read_truth_model, read_truth_vertices
+from capture4d.scans import Capture, TruthModel, read_capture, read_truth_model, read_truth_vertices
 from capture4d.types import RegisteredSequence
 from capture4d.work_folder import VERDICTS, capture_path, load_records, load_registration
 from capture4d.workdir import open_stage, read_json, require_complete, run_jobs, write_bytes, write_json
@@ -118,7 +118,7 @@ def run(
     summary = summarise(records)
     if tracked is not None:
         summary |= tracked.metrics
-    heat = {"fit error": summary["fit_p95_mm"], "correspondence error": summary.get("correspondence_p95_mm")}
+    heat = {"fit error": summary.get("fit_p95_mm"), "correspondence error": summary.get("correspondence_p95_mm")}
     scales = {title: _round_up(value) for title, value in heat.items() if value is not None}
     rows = _draw(work, description, _drawn_rows(records, config.pictures), scales, workers)
     stages = Stages(
@@ -197,15 +197,22 @@ def _draw_row(
 ) -> tuple[int, list[list[Panel]]]:
     registered, model = _registered(work / "registration"), _model(capture.path)
     frame_id, vertices = int(registered.frame_ids[row]), np.array(registered.vertices[row])
-    errors = {"fit error": (1e3 * registered.residual_m[row].astype(float), scales["fit error"])}
-    if model is not None:
+    errors = {}
+    if "fit error" in scales:
+        errors["fit error"] = (1e3 * registered.residual_m[row].astype(float), scales["fit error"])
+    if model is not None and "correspondence error" in scales:
         fine = read_truth_vertices(capture, frame_id)
         places = material_points(fine, model.fine.faces, model.template_faces, model.template_barycentric)
         values = 1e3 * correspondence_errors(vertices, places)
         errors["correspondence error"] = (values, scales["correspondence error"])
     colours = dict(capture.boundary_colours)
     return row, draw_frame(
-        read_scan(capture, frame_id), registered.garment, vertices, framing, errors_mm=errors, border_colours=colours
+        readable_scan(capture, frame_id),
+        registered.garment,
+        vertices,
+        framing,
+        errors_mm=errors,
+        border_colours=colours,
     )
 
 
@@ -215,7 +222,7 @@ def _drawn_rows(records: Sequence[Mapping[str, Any]], count: int) -> list[int]:
     flagged = [row for row, record in enumerate(records) if record["verdict"] != "good"]
     if flagged:
         rows.add(
-            max(flagged, key=lambda row: (VERDICTS.index(records[row]["verdict"]), records[row]["fit_p95_mm"] or 0))
+            max(flagged, key=lambda row: (VERDICTS.index(records[row]["verdict"]), records[row].get("fit_p95_mm") or 0))
         )
     return sorted(rows)
 

@@ -11,15 +11,18 @@ from jaxtyping import Float32, UInt8
 from PIL import Image
 
 from capture4d.app.render import Direction, Drawn, View, frame_view, heat_colours, render, trace
-from capture4d.scans import Colour
+from capture4d.errors import InputError
+from capture4d.scans import Capture, Colour, read_scan
 from capture4d.types import Garment, Scan
 
-__all__ = ["VIEWS", "Framing", "Panel", "colour_bar", "data_uri", "draw_frame"]
+__all__ = ["NO_SCAN", "VIEWS", "Framing", "Panel", "colour_bar", "data_uri", "draw_frame", "no_scan", "readable_scan"]
 
 VIEWS: tuple[Direction, ...] = ("three_quarter", "back")
 WIDTH, HEIGHT = 400, 370
 CLOTH = (176, 190, 208)
 LOOP = (222, 140, 28)
+NO_SCAN = "no scan"
+"""Title of the empty picture of a frame whose scan cannot be read."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,8 +45,21 @@ class Panel:
     uri: str
 
 
+def readable_scan(capture: Capture, frame_id: int) -> Scan | None:
+    """The scan of a frame; None if it cannot be read, which is no news: extraction has flagged the frame."""
+    try:
+        return read_scan(capture, frame_id)
+    except InputError:
+        return None
+
+
+def no_scan() -> Panel:
+    """What stands for the picture of a scan that cannot be read."""
+    return Panel(NO_SCAN, data_uri(np.full((HEIGHT, WIDTH, 3), 236, np.uint8)))
+
+
 def draw_frame(
-    scan: Scan,
+    scan: Scan | None,
     garment: Garment,
     vertices: Float32[np.ndarray, "verts 3"],
     framing: Framing,
@@ -54,6 +70,7 @@ def draw_frame(
     """Pictures of one frame: a row for each of VIEWS.
 
     Args:
+        scan: None if it cannot be read.
         errors_mm: per-vertex errors by title, each with the value at which its colours saturate.
         border_colours: paint of the loops; loops without are drawn orange.
     """
@@ -63,10 +80,13 @@ def draw_frame(
     rows = []
     for direction in VIEWS:
         view = framing.view(vertices, direction)
-        scanned = render([Drawn(scan.mesh, scan.colours)], view, width=WIDTH, height=HEIGHT)
+        scanned = no_scan()
+        if scan is not None:
+            picture = render([Drawn(scan.mesh, scan.colours)], view, width=WIDTH, height=HEIGHT)
+            scanned = Panel("scan", data_uri(picture))
         traced = trace([mesh], view, width=WIDTH, height=HEIGHT)
         panels = [Panel(title, data_uri(traced.painted([colours]))) for title, colours in paints.items()]
-        rows.append([Panel("scan", data_uri(scanned)), *panels])
+        rows.append([scanned, *panels])
     return rows
 
 

@@ -21,14 +21,14 @@ from capture4d.app.calibration_page import calibration_charts, calibration_tiles
 from capture4d.app.charts import Line, line_chart
 from capture4d.app.render import Drawn, render
 from capture4d.app.report_metrics import column
-from capture4d.app.report_pictures import VIEWS, Framing, Panel, data_uri
+from capture4d.app.report_pictures import VIEWS, Framing, Panel, data_uri, no_scan, readable_scan
 from capture4d.body import pose_frame, with_shape
 from capture4d.body_stage import load_tracking
 from capture4d.errors import InputError
 from capture4d.garment_extraction import classify_colours, settle_labels
 from capture4d.garment_stage import load_garment_scan
 from capture4d.records import ArrayFile, load_poses
-from capture4d.scans import Capture, read_rig, read_scan
+from capture4d.scans import Capture, read_rig
 from capture4d.take_colours import KnownColours, take_colours
 from capture4d.types import Mesh, PoseSequence, RegisteredSequence
 from capture4d.workdir import read_json, run_jobs
@@ -203,7 +203,9 @@ def _draw_row(
     work: Path, capture: Capture, colours: KnownColours, loops: Mapping[int, list[np.ndarray]], row: int
 ) -> StagePictures:
     frame_id = capture.frame_ids[row]
-    scan = read_scan(capture, frame_id)
+    scan = readable_scan(capture, frame_id)
+    if scan is None:
+        return StagePictures(row, [no_scan()], [])
     paints = tuple(dict.fromkeys(colours.boundary.values()))
     found = classify_colours(colours.flat(scan).colours, colours.garment, paints, others=colours.others)
     labels = settle_labels(scan.mesh.faces, found)

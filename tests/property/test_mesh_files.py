@@ -1,16 +1,19 @@
 """What is written is read back, whatever the mesh."""
 
+import io
 import tempfile
 from pathlib import Path
 
 import numpy as np
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from PIL import Image
 
 from capture4d.errors import InputError
 from capture4d.mesh import boundary_edges, boundary_loops, unique_edges
-from capture4d.mesh_files import read_mesh, write_mesh
+from capture4d.mesh_files import read_coloured_mesh, read_mesh, write_mesh
 from capture4d.types import Mesh
 
 FLOATS = st.floats(-1e6, 1e6, width=32, allow_subnormal=False)
@@ -87,7 +90,8 @@ def test_loops_are_the_border_of_any_part_of_a_sheet(data: st.DataObject):
 
 
 def _sample_files() -> dict[str, bytes]:
-    vertices = np.random.default_rng(0).random((6, 3), np.float32)
+    rng = np.random.default_rng(0)
+    vertices = rng.random((6, 3), np.float32)
     faces = np.array([[0, 1, 2], [0, 2, 3], [1, 4, 5]], np.int32)
     mesh = Mesh(vertices, faces, np.random.default_rng(1).random((3, 3, 2), np.float32))
     files = {}
@@ -96,6 +100,11 @@ def _sample_files() -> dict[str, bytes]:
             path = Path(folder) / f"mesh{suffix}"
             write_mesh(path, mesh, colours=np.full((6, 3), 7, np.uint8), polygon_sizes=np.array([4, 3], np.int32))
             files[path.name] = path.read_bytes()
+        model = trimesh.Trimesh(vertices, faces, process=False)
+        model.visual = trimesh.visual.TextureVisuals(
+            rng.random((6, 2)), material=trimesh.visual.material.PBRMaterial(baseColorTexture=PICTURE)
+        )
+        files["textured.glb"] = trimesh.Scene(model).export(file_type="glb")
     head = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
     files["text.ply"] = f"{head}element face 1\nproperty list char int vertex_indices\nend_header\n".encode() + (
         b"0 0 0\n1 0 0\n1 1 0\n3 0 1 2\n"
@@ -103,6 +112,7 @@ def _sample_files() -> dict[str, bytes]:
     return files
 
 
+PICTURE = Image.fromarray(np.random.default_rng(2).integers(0, 256, (4, 4, 3), np.uint8))
 SAMPLES = _sample_files()
 SPLICE = st.tuples(st.floats(0, 1), st.integers(0, 6), st.binary(max_size=4))
 
@@ -110,17 +120,52 @@ SPLICE = st.tuples(st.floats(0, 1), st.integers(0, 6), st.binary(max_size=4))
 @given(st.sampled_from(sorted(SAMPLES)), st.lists(SPLICE, min_size=1, max_size=3))
 @settings(max_examples=400, deadline=None)
 def test_a_damaged_file_is_a_mesh_or_one_line(name: str, splices: list[tuple[float, int, bytes]]):
-    data = SAMPLES[name]
-    for place, removed, inserted in splices:
-        start = int(place * len(data))
-        data = data[:start] + inserted + data[start + removed :]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / name
-        path.write_bytes(data)
+        path.write_bytes(spliced(SAMPLES[name], splices))
         said = ""
         try:
-            read_mesh(path)
+            read_coloured_mesh(path)
         except InputError as error:
             said = str(error)
     assert not said or said.startswith(str(path))
+    assert "\n" not in said
+
+
+def spliced(data: bytes, splices: list[tuple[float, int, bytes]]) -> bytes:
+    for place, removed, inserted in splices:
+        start = int(place * len(data))
+        data = data[:start] + inserted + data[start + removed :]
+    return data
+
+
+def _textured_obj() -> dict[str, bytes]:
+    pictures = {}
+    for kind in ("png", "jpeg", "tiff"):
+        stream = io.BytesIO()
+        PICTURE.save(stream, kind)
+        pictures[f"skin.{kind}"] = stream.getvalue()
+    return pictures | {"mesh.mtl": b"newmtl skin\nmap_Kd skin.png\n"}
+
+
+COMPANIONS = _textured_obj()
+
+
+@given(st.sampled_from(sorted(COMPANIONS)), st.lists(SPLICE, min_size=1, max_size=3))
+@settings(max_examples=200, deadline=None)
+def test_a_damaged_texture_is_a_picture_or_one_line(name: str, splices: list[tuple[float, int, bytes]]):
+    picture = "skin.png" if name.endswith("mtl") else name
+    files = COMPANIONS | {"mesh.mtl": f"newmtl skin\nmap_Kd {picture}\n".encode()}
+    files[name] = spliced(files[name], splices)
+    with tempfile.TemporaryDirectory() as folder:
+        for file, data in files.items():
+            (Path(folder) / file).write_bytes(data)
+        path = Path(folder) / "mesh.obj"
+        path.write_text("mtllib mesh.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n")
+        said = ""
+        try:
+            read_coloured_mesh(path)
+        except InputError as error:
+            said = str(error)
+    assert not said or said.startswith(folder)
     assert "\n" not in said

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from capture4d.body import skin, unskin, with_pose, with_shape
 from capture4d.body_smpl import read_smpl
 from capture4d.errors import InputError
+from capture4d.motion_retarget import SMPL_TREE
 from capture4d.types import Body, Mesh
 from capture4d.workdir import write_npz
 
@@ -87,9 +89,8 @@ def test_too_many_shape_coefficients_are_refused() -> None:
         with_shape(make_body(), np.zeros(4))
 
 
-def smpl_fields(seed: int = 0) -> dict[str, np.ndarray]:
-    rng = np.random.default_rng(seed)
-    verts, joints = 30, 24
+def smpl_fields(seed: int = 0, joints: int = 24) -> dict[str, np.ndarray]:
+    rng, verts = np.random.default_rng(seed), 30
     weights = rng.dirichlet(np.ones(joints), verts)
     return {
         "v_template": rng.normal(size=(verts, 3)),
@@ -139,6 +140,34 @@ def test_pickle_with_anything_but_arrays_is_refused(tmp_path: Path, monkeypatch:
     with pytest.raises(InputError, match=r"body\.pkl: expected only arrays in the pickle, found"):
         read_smpl(tmp_path / "body.pkl")
     assert not (tmp_path / "owned").exists()
+
+
+@pytest.mark.parametrize(("joints", "last"), [(24, "right_hand"), (52, "joint_51"), (55, "joint_54")])
+def test_the_joints_that_the_family_shares_have_its_names(joints: int, last: str, tmp_path: Path) -> None:
+    write_npz(tmp_path / "body.npz", **smpl_fields(joints=joints))
+    names = read_smpl(tmp_path / "body.npz").joint_names
+    assert names[:22] == tuple(SMPL_TREE)
+    assert names[-1] == last
+    assert len(set(names)) == joints
+
+
+def test_what_is_no_array_of_numbers_is_passed_over(tmp_path: Path) -> None:
+    np.savez(tmp_path / "body.npz", **smpl_fields(), note="by hand", part2num=np.array({"pelvis": 0}, object))
+    assert len(read_smpl(tmp_path / "body.npz").joints) == 24
+    fields = smpl_fields()
+    fields["weights"] = fields["weights"].astype(object)
+    np.savez(tmp_path / "body.npz", **fields)
+    with pytest.raises(InputError, match="found no weights"):
+        read_smpl(tmp_path / "body.npz")
+
+
+@pytest.mark.parametrize("name", ["shape_directions", "joints", "joint_directions", "skin_weights"])
+def test_a_body_is_of_finite_numbers(name: str) -> None:
+    body = make_body()
+    broken = getattr(body, name).copy()
+    broken[(0,) * broken.ndim] = np.nan
+    with pytest.raises(InputError, match=rf"Body\.{name}: expected finite numbers"):
+        replace(body, **{name: broken})
 
 
 def test_missing_parts_are_named(tmp_path: Path) -> None:

@@ -11,10 +11,13 @@ import pytest
 from scipy.spatial import KDTree
 
 from benchmarks.dressed_body import dress_body
+from capture4d import body_stage
 from capture4d.body import pose_frame, with_shape
 from capture4d.body_anny import load_anny
+from capture4d.body_sequence import Followed, Quality
 from capture4d.body_stage import load_tracking, run, tracking_digest
 from capture4d.body_tracking_config import TrackingConfig
+from capture4d.body_tracking_jacobian import BodyState
 from capture4d.errors import InputError
 from capture4d.mesh import submesh
 from capture4d.motion_retarget import pose_sequence
@@ -101,6 +104,37 @@ def test_a_frame_says_which_limbs_nobody_scanned_and_what_is_wrong_with_its_scan
     here, there = with_shape(body, found.shape), with_shape(body, truth.shape)
     apart = pose_frame(here, found, 0).vertices() - pose_frame(there, truth, 0).vertices()
     assert np.linalg.norm(apart, axis=1).mean() < 0.02, "a lost first frame has the pose of the next one"
+
+
+@pytest.mark.parametrize("writer", ["write_json", "write_npz"])
+def test_a_frame_is_done_once_all_its_files_are_written(
+    writer: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Killed right after any of its files, the frame is either still to be done or whole."""
+    write = getattr(body_stage, writer)
+
+    def write_and_die(path: Path, *arguments: object, **arrays: object) -> None:
+        write(path, *arguments, **arrays)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(body_stage, writer, write_and_die)
+    state = BodyState(np.eye(3)[None], np.zeros(3), np.zeros(2))
+    followed = Followed(state, np.zeros((2, 2)), Quality((), False, 1.0, 0.001, 0.0), "start", 0, 0)
+    path = tmp_path / "frames" / "000005.npz"
+    with pytest.raises(KeyboardInterrupt):
+        body_stage._save_followed(path, followed, 0.1)
+    assert not path.is_file() or (tmp_path / "times" / "000005.json").is_file()
+
+
+def test_nothing_but_damaged_scans_is_an_error_again_and_again(tmp_path: Path) -> None:
+    dressed_capture(tmp_path / "capture", 2)
+    for path in (tmp_path / "capture" / "scans").iterdir():
+        path.write_bytes(b"ply")
+    for _ in range(2):
+        with pytest.raises(InputError, match=r"000005\.ply: "):
+            run(tmp_path / "capture", tmp_path / "work" / "body", TrackingConfig(start="rest"))
+    with pytest.raises(InputError, match="'track' is not finished"):
+        tracking_digest(tmp_path / "work" / "body", tmp_path / "capture")
 
 
 def test_a_start_that_is_no_file_and_a_stage_that_was_not_run(tmp_path: Path) -> None:

@@ -275,6 +275,22 @@ def test_a_frame_that_lies_off_as_no_other_of_the_take_is_an_outlier() -> None:
     assert not outlying(np.full(3, np.nan), SequenceConfig())[1].any()
 
 
+def test_a_bad_first_frame_says_nothing_about_the_shape() -> None:
+    """Points that no body explains: what is seen in them must not hold the shape of the take."""
+    body = load_anny()
+    tracker = Tracker.create(body, TrackingConfig())
+    rest = tracker.model.rest_state()
+    surface = pose_surface(tracker.model, rest)
+    rng = np.random.default_rng(3)
+    chosen = rng.choice(len(surface.vertices), 600, replace=False)
+    for away, good in ((0.0, True), (0.05, False)):
+        shift = away * rng.standard_normal((600, 3))
+        scan = ScanPoints(surface.vertices[chosen] + shift, surface.normals[chosen], np.zeros(600, bool))
+        first = tracker.begin(scan, rest)
+        assert (first.quality.reasons == ()) is good
+        assert first.shape_information.any() == good
+
+
 def test_unknown_shape_information_is_symmetric_and_positive(stick: Body) -> None:
     model, prior = tracked_body(stick), joint_prior(stick)
     true = random_state(stick, np.random.default_rng(9), 0.1)

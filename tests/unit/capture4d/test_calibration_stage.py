@@ -2,19 +2,21 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from capture4d import calibration_stage
 from capture4d.app.cli import main
 from capture4d.calibration_board import parse_board
 from capture4d.calibration_report import rig_difference
 from capture4d.calibration_stage import find_images
 from capture4d.errors import InputError
 from capture4d.projection import rotation_from_vector
-from capture4d.records import load_rig
+from capture4d.records import load_rig, save_rig
 from capture4d.rig_adjustment import RigEstimate
 from data_synth.board_images import photograph_board
 from data_synth.board_views import calibration_rig, visible_corners, wave_board
@@ -116,6 +118,49 @@ def test_corners_are_detected_once(shoot, tmp_path: Path, monkeypatch: pytest.Mo
     assert run(*calibrate(folder / "images", tmp_path / "rig.json", "--hold-out", "0", "--no-flatness")) == 0
     first, second = (load_rig(path / "rig.json").T_camera_world for path in (folder, tmp_path))
     np.testing.assert_allclose(first, second, atol=1e-7)
+
+
+def test_an_image_that_cannot_be_read_does_not_cost_those_that_can(
+    shoot, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    folder, _, _ = shoot
+    images = shutil.copytree(folder / "images", tmp_path / "images")
+    broken = images / "cam02" / "008.png"
+    whole = broken.read_bytes()
+    broken.write_bytes(whole[:200])
+    rig = tmp_path / "rig.json"
+    assert "008.png: not a readable image" in fails(capsys, *calibrate(images, rig))
+    broken.write_bytes(whole)
+    seen = []
+    detect = calibration_stage.detect_corners
+    monkeypatch.setattr(calibration_stage, "detect_corners", lambda *a: seen.append(1) or detect(*a))
+    assert run(*calibrate(images, rig, "--hold-out", "0", "--no-flatness")) == 0
+    assert len(seen) == 1
+
+
+def test_what_lies_beside_another_rig_is_not_used(shoot, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    folder, _, _ = shoot
+    for name in ("rig.json", "calibration.json", "calibration_covariance.npz"):
+        shutil.copy(folder / name, tmp_path / name)
+    assert run("check-rig", tmp_path / "rig.json", folder / "still", "--workers", "1") == 0
+    other = load_rig(folder / "rig.json")
+    save_rig(tmp_path / "rig.json", replace(other, T_camera_world=other.T_camera_world + 1e-9))
+    said = fails(capsys, "check-rig", tmp_path / "rig.json", folder / "still")
+    assert said.endswith("calibration.json is of another rig.json")
+    digest = calibration_stage._rig_digest(tmp_path / "rig.json")
+    assert calibration_stage._read_covariance(tmp_path / "calibration_covariance.npz", digest, cameras=CAMERAS) is None
+    digest = calibration_stage._rig_digest(folder / "rig.json")
+    found = calibration_stage._read_covariance(tmp_path / "calibration_covariance.npz", digest, cameras=CAMERAS)
+    assert found is not None
+
+
+def test_a_rig_is_not_written_over_a_file_that_was_meant_for_a_folder(
+    shoot, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    (tmp_path / "notes").write_text("mine")
+    said = fails(capsys, "convert-rig", shoot[0] / "rig.json", "--output", tmp_path / "notes")
+    assert said.startswith(f"capture4d: {tmp_path / 'notes'}: ")
+    assert (tmp_path / "notes").read_text() == "mine"
 
 
 def test_a_floor_is_a_pose_that_was_filmed(shoot, tmp_path: Path, capsys: pytest.CaptureFixture[str]):

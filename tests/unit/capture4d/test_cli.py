@@ -39,6 +39,18 @@ def fails(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
     return line
 
 
+def still_poses(frames: tuple[int, ...]) -> PoseSequence:
+    """Of a body of one joint."""
+    return PoseSequence(
+        rotations=np.tile(np.eye(3, dtype=np.float32), (len(frames), 1, 1, 1)),
+        translations=np.zeros((len(frames), 3), np.float32),
+        shape=np.zeros(1, np.float32),
+        frame_ids=np.array(frames, np.int32),
+        fps=60.0,
+        joint_names=("root",),
+    )
+
+
 def extract(capture: Path, work: Path) -> tuple[str | Path, ...]:
     return "extract", capture, "--output", work, "--workers", "1"
 
@@ -200,7 +212,7 @@ def test_a_repaired_scan_is_read_by_the_same_command(
 ):
     path = tube_capture / "scans" / "000007.ply"
     good = path.read_bytes()
-    path.write_bytes(good[:-9] + b"\xff" * 9)  # same size: face 7 points nowhere
+    path.write_bytes(good[:-9])
     assert run(*extract(tube_capture, work)) == 0
     assert "first in 7: " in capsys.readouterr().err
     done = work / "garment" / "frames" / "000005.npz"
@@ -210,6 +222,41 @@ def test_a_repaired_scan_is_read_by_the_same_command(
     assert "no garment" not in capsys.readouterr().err
     assert len(load_garment_scan(work / "garment" / "frames" / "000007.npz", 7).mesh.vertices)
     assert done.stat().st_mtime_ns == before
+    scan = tube_capture / "scans" / "000005.ply"
+    scan.write_bytes(scan.read_bytes() + b"0")
+    assert "use --overwrite" in fails(capsys, *extract(tube_capture, work)), "this one was read"
+
+
+def test_what_registration_starts_from_is_what_it_was(
+    tube_capture: Path, work: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    register = ("register", tube_capture, "--output", work, "--workers", "1")
+    assert run(*extract(tube_capture, work)) == 0
+    other = shutil.copytree(tube_capture, tmp_path / "other")
+    description = json.loads((other / "capture.json").read_text())
+    write_json(other / "capture.json", {**description, "fps": 30.0})
+    said = fails(capsys, "register", other, "--output", work)
+    assert "expected the output of 'extract' from this capture as it is now" in said
+    assert said.endswith(f"run: capture4d extract {other} --output {work} --overwrite")
+
+    assert run(*register) == 0
+    template = load_garment(tube_capture / "template.npz")
+    moved = template.template.with_vertices(template.template.vertices + np.float32(0.001))
+    save_garment(tube_capture / "template.npz", replace(template, template=moved))
+    assert "upstream.template" in fails(capsys, *register)
+    save_garment(tube_capture / "template.npz", template)
+    assert run(*register) == 0
+    save_poses(tube_capture / "poses.npz", still_poses((5, 6, 7)))
+    assert run(*extract(tube_capture, work)) == 0, "poses do not concern it"
+    assert "upstream.motion" in fails(capsys, *register)
+
+
+def test_a_run_without_a_template_ends_before_it_begins(
+    tube_capture: Path, work: Path, capsys: pytest.CaptureFixture[str]
+):
+    (tube_capture / "template.npz").unlink()
+    assert "registration needs a template" in fails(capsys, "run", tube_capture, "--output", work)
+    assert not work.exists()
 
 
 @pytest.mark.parametrize("entry", ["garment_colour", "boundary_colours"])
@@ -235,15 +282,7 @@ def test_a_template_without_the_borders_that_are_painted(
 
 
 def test_poses_that_do_not_match_the_scans(tube_capture: Path, work: Path, capsys: pytest.CaptureFixture[str]):
-    poses = PoseSequence(
-        rotations=np.tile(np.eye(3, dtype=np.float32), (2, 1, 1, 1)),
-        translations=np.zeros((2, 3), np.float32),
-        shape=np.zeros(1, np.float32),
-        frame_ids=np.array([5, 6], np.int32),
-        fps=60.0,
-        joint_names=("root",),
-    )
-    save_poses(tube_capture / "poses.npz", poses)
+    save_poses(tube_capture / "poses.npz", still_poses((5, 6)))
     assert run(*extract(tube_capture, work)) == 0
     said = fails(capsys, "register", tube_capture, "--output", work, "--workers", "1")
     assert "poses.npz: expected a pose for each of 3 scans, found none for 1 of them, frame 7 first" in said
@@ -316,6 +355,26 @@ def test_run_does_every_stage_and_a_second_run_nothing(
     assert {path: path.stat().st_mtime_ns for path in work.rglob("*.npz")} == made
     assert run("report", work, "--fail-above", "fit_mean_mm=1.0") == 0
     assert "no metric 'beauty'" in fails(capsys, "report", work, "--fail-above", "beauty=1")
+
+
+def test_run_reports_a_take_with_a_scan_that_is_cut_short(tube_capture: Path, work: Path):
+    path = tube_capture / "scans" / "000006.ply"
+    path.write_bytes(path.read_bytes()[:1000])
+    assert run("run", tube_capture, "--output", work, "--workers", "1") == 0
+    page = (work / "report" / "index.html").read_text()
+    assert "000006.ply: cut off" in page
+    assert 'alt="no scan, frame 6"' in page
+    metrics = json.loads((work / "report" / "metrics.json").read_text())["metrics"]
+    assert {entry["key"]: entry["value"] for entry in metrics}["frames_failed"] == 1
+
+
+def test_run_reports_a_take_in_which_every_frame_failed(tube_capture: Path, work: Path):
+    template = load_garment(tube_capture / "template.npz")
+    far = template.template.with_vertices(template.template.vertices + np.float32(9))
+    save_garment(tube_capture / "template.npz", replace(template, template=far))
+    assert run("run", tube_capture, "--output", work, "--workers", "1") == 0
+    metrics = json.loads((work / "report" / "metrics.json").read_text())["metrics"]
+    assert {entry["key"]: entry["value"] for entry in metrics}["frames_failed"] == 3
 
 
 def test_register_mesh_keeps_the_templates_faces_and_measures(

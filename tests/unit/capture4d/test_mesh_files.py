@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from capture4d.errors import InputError
-from capture4d.mesh_files import read_mesh, write_mesh
+from capture4d.mesh_files import read_coloured_mesh, read_mesh, write_mesh
 from capture4d.types import Mesh
 
 QUAD_AND_TRIANGLE = """\
@@ -139,3 +139,30 @@ def test_nan_in_a_ply_is_named(tmp_path: Path):
     path.write_bytes(head + b"end_header\n" + struct.pack("<f", np.nan) + body[4:])
     with pytest.raises(InputError, match=r"nan\.ply: Mesh\.vertices: expected finite numbers"):
         read_mesh(path)
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".glb"])
+def test_a_texture_too_large_to_be_read_is_one_line(
+    suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import trimesh
+    from PIL import Image
+
+    picture = Image.fromarray(np.zeros((40, 40, 3), np.uint8))
+    path = tmp_path / f"scan{suffix}"
+    vertices, faces = np.eye(3), np.array([[0, 1, 2]])
+    if suffix == ".glb":
+        model = trimesh.Trimesh(vertices, faces, process=False)
+        material = trimesh.visual.material.PBRMaterial(baseColorTexture=picture)
+        model.visual = trimesh.visual.TextureVisuals(np.eye(3)[:, :2], material=material)
+        path.write_bytes(trimesh.Scene(model).export(file_type="glb"))
+    else:
+        picture.save(tmp_path / "skin.png")
+        (tmp_path / "scan.mtl").write_text("newmtl skin\nmap_Kd skin.png\n")
+        path.write_text("mtllib scan.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n")
+    assert read_coloured_mesh(path).colours is not None
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1000)
+    assert suffix == ".glb" or read_coloured_mesh(path).colours is not None, "Pillow warns only"
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)
+    with pytest.raises(InputError, match="too large"):
+        read_coloured_mesh(path)

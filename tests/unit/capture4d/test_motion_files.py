@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from capture4d.body import pose_frame, with_shape
 from capture4d.body_anny import load_anny
 from capture4d.body_smpl import SMPL_JOINTS
-from capture4d.bvh_format import Bvh, format_bvh
+from capture4d.bvh_format import Bvh, format_bvh, read_bvh
 from capture4d.errors import InputError
 from capture4d.motion_files import read_motion, resample, write_motion
 from capture4d.motion_retarget import SMPL_TREE, retarget
@@ -232,3 +233,56 @@ def test_what_is_no_motion_is_named(tmp_path: Path) -> None:
     write_motion(tmp_path / "own.npz", body, replace(random_poses(body, 7), joint_names=tuple("j" * 36)))
     with pytest.raises(InputError, match="expected the body's 36 joints"):
         read_motion(tmp_path / "own.npz", body)
+
+
+def test_a_body_without_the_joints_that_a_motion_drives_is_named() -> None:
+    body, source = load_anny(), cmu_clip(*NAMINGS[0], 0)
+    for missing in ("upperleg01.L", "lowerarm01.R", "head"):
+        names = tuple(name.replace(missing, "other") for name in body.joint_names)
+        shaped = with_shape(replace(body, joint_names=names), np.zeros(0, np.float32))
+        with pytest.raises(InputError, match=f"found none called {missing}"):
+            retarget(shaped, source, 60.0)
+
+
+BVH = """HIERARCHY
+ROOT hips
+{
+  OFFSET 0 0 0
+  CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
+  End Site
+  {
+    OFFSET 0 1 0
+  }
+}
+MOTION
+Frames: 1
+Frame Time: 0.01
+0 0 0 0 0 0
+"""
+
+
+def test_what_is_no_bvh_is_named_by_its_line(tmp_path: Path) -> None:
+    path = tmp_path / "clip.bvh"
+    path.write_text(BVH)
+    assert read_bvh(path).joint_names == ("hips",)
+    for before, after, said in (
+        ("Frames: 1", "Frames: 0", "line 12: expected at least one frame, found 0"),
+        ("Frames: 1", "Frames: -2", "line 12: expected at least one frame, found -2"),
+        ("Frames: 1", "Frames: 2", "line 15: not a BVH file, or cut short"),
+        ("Time: 0.01", "Time: 0", "line 13: expected a positive frame time, found 0"),
+        ("Time: 0.01", "Time: nan", "line 13: expected a positive frame time, found nan"),
+        ("ROOT hips\n{", "{\nROOT hips", "line 2: not a BVH file"),
+        (BVH[: BVH.index("MOTION")], "HIERARCHY\n", "expected a joint tree"),
+        ("Zrotation Xrotation", "Wrotation Xrotation", "line 5: not a BVH file"),
+        ("0 0 0 0 0 0", "0 0 0 0 nan 0", "expected finite channel values"),
+        ("0 0 0 0 0 0", "0 0 0", "line 14: expected 6 channel values, found 3"),
+    ):
+        path.write_text(BVH.replace(before, after))
+        with pytest.raises(InputError, match=re.escape(said)):
+            read_bvh(path)
+
+
+def test_poses_have_a_shape_of_finite_numbers() -> None:
+    poses = random_poses(load_anny(), 0)
+    with pytest.raises(InputError, match=r"PoseSequence\.shape: expected finite numbers"):
+        replace(poses, shape=np.array([np.nan], np.float32))

@@ -10,10 +10,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from capture4d.app.check_take import time_stamp
 from capture4d.app.cli import main
+from capture4d.body import pose_frame, with_shape
+from capture4d.body_anny import load_anny
 from capture4d.mesh_files import read_coloured_mesh, read_mesh, write_mesh
+from capture4d.motion_retarget import pose_sequence
 from capture4d.preflight import ADVICE, CODES, BadFrame, TakeFacts, judge
+from capture4d.records import load_poses, save_body, save_poses
 from capture4d.scan_placement import Placement, find_units, place, place_rig, upright
 from capture4d.scan_statistics import (
     FrameStatistics,
@@ -390,6 +396,83 @@ def test_a_fixed_take_is_clean_and_the_original_untouched(
         fixed = read_mesh(tmp_path / "take-fixed" / "scans" / "000011.ply").mesh
         # The floor is known to a few centimetres; everything else exactly.
         np.testing.assert_allclose(fixed.vertices, sound[11].mesh.vertices, atol=0.04 if wrong == "floor" else 1e-4)
+
+
+@pytest.mark.parametrize("brings_body", [True, False])
+def test_poses_are_fixed_with_the_scans_whose_floor_they_share(
+    brings_body: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    body = load_anny()
+    person = with_shape(body, np.array([0.5, -0.5], np.float32))
+    rotations = np.tile(np.eye(3), (5, len(body.joint_names), 1, 1))
+    for row in range(5):
+        turn = Rotation.from_euler("z", 6 * row, degrees=True).as_matrix()
+        rotations[row, body.joint_names.index("upperarm01.L")] = turn
+    poses = pose_sequence(person, rotations, 30.0)
+    poses = replace(poses, translations=poses.translations + np.array([0, 0.4, 0], np.float32))
+    trunk = np.isin(body.skin_weights.argmax(axis=1), [body.joint_names.index(f"spine0{k}") for k in range(1, 6)])
+    scans = {}
+    for row in range(5):
+        mesh = body.template.with_vertices(pose_frame(person, poses, row).vertices().astype(np.float32))
+        scans[row] = Scan(mesh, np.where(trunk[:, None], BLUE, GREY).astype(np.uint8), row, 0.0)
+    take = write(tmp_path / "take", scans, boundary_colours={})
+    save_poses(take / "poses.npz", poses)
+    if brings_body:
+        save_body(take / "body.npz", body)
+    found = check(capsys, take, "--fix")[1]
+    assert {"floor"} == set(codes(found)) - {"noise", "holes"}
+    moved = load_poses(tmp_path / "take-fixed" / "poses.npz").translations - poses.translations
+    np.testing.assert_allclose(moved, np.tile([0, -0.4, 0], (5, 1)), atol=0.01)
+    assert not {"floor", "poses-mismatch"} & set(codes(check(capsys, tmp_path / "take-fixed")[1]))
+
+
+def test_a_killed_fix_is_repeated_and_lies_beside_the_take(
+    sound: dict[int, Scan], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    take = write(tmp_path / "take", moved(sound, 1000 * np.eye(3)))
+
+    def die(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.chdir(take)
+    with monkeypatch.context() as patched:
+        patched.setattr("capture4d.app.check_fix._copy_companions", die)
+        with pytest.raises(SystemExit) as exit_:
+            main(["check", ".", "--fix", "--workers", "1"])
+        assert exit_.value.code == 130
+    assert not (tmp_path / "take-fixed").exists()
+    assert check(capsys, ".", "--fix")[1]["fixed"] == str(tmp_path / "take-fixed")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["take", "take-fixed"]
+    assert sorted(path.name for path in take.iterdir()) == ["capture.json", "scans"]
+
+
+def test_a_bare_template_is_placed_as_the_scans_are(
+    sound: dict[int, Scan], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    take = write(tmp_path / "take", moved(sound, 1000 * TURN))
+    for scan in moved({0: sound[10]}, 1000 * TURN).values():
+        write_mesh(take / "template.obj", scan.mesh)
+    assert set(codes(check(capsys, take, "--fix")[1])) == {"units", "axes"}
+    fixed = read_mesh(tmp_path / "take-fixed" / "template.obj").mesh
+    np.testing.assert_allclose(fixed.vertices, sound[10].mesh.vertices, atol=1e-4)
+    np.testing.assert_array_equal(fixed.faces, sound[10].mesh.faces)
+
+
+def test_what_the_command_line_says_is_kept(sound: dict[int, Scan], tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    take = write(tmp_path / "take", moved(sound, 1000 * np.eye(3)), garment_colour=None, boundary_colours={})
+    options = ("--garment-colour", "2f62c9", "--border-colour", "#FFC400", "--fps", "25")
+    check(capsys, take, "--fix", *options)
+    description = json.loads((tmp_path / "take-fixed" / "capture.json").read_text())
+    assert description["garment_colour"] == "#2f62c9"
+    assert description["boundary_colours"] == {"border": "#ffc400"}
+    assert description["fps"] == 25
+
+
+def test_a_time_stamp_that_is_a_date_tells_nothing(tmp_path: Path):
+    path = tmp_path / "1.ply"
+    for text, seconds in (("time 1.25", 1.25), ("time 2023-05-01", None), ("timestamp ...", None), ("nothing", None)):
+        path.write_text(f"ply\ncomment {text}\nend_header\n")
+        assert time_stamp(path) == seconds
 
 
 def test_unusable_frames_are_left_out(sound: dict[int, Scan], tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -67,6 +69,17 @@ def test_a_survey_lifts_for_the_same_person_only(model: TrackedBody):
     assert other.person_ratio > 1
     assert not other.floor_exact
     assert other.placement.lift_m == 0
+
+
+def test_motion_capture_moves_with_the_scans_whose_floor_it_shares(model: TrackedBody):
+    for scans_m, poses_m, expected in ((0.4, 0.4, (-0.4, -0.4)), (0.3, 0.0, (-0.3, 0.0)), (0.0, 0.3, (0.0, 0.0))):
+        scans = upper_bodies(model, scans_m)
+        moved = [
+            replace(state, translation=state.translation + np.array([0, poses_m, 0])) for state in states(model, PERSON)
+        ]
+        survey = survey_take(scans, 1.0, Motion(model, moved, scans, True))
+        found = (survey.placement.lift_m, survey.poses_lift_m)
+        np.testing.assert_allclose(found, expected, atol=0.01)
 
 
 def test_samples_keep_their_normals(model: TrackedBody):

@@ -19,6 +19,7 @@ from capture4d.scans import (
     load_body,
     load_garment,
     load_rig,
+    motion_digest,
     parse_colour,
     read_capture,
     read_poses,
@@ -31,6 +32,8 @@ from capture4d.scans import (
     save_garment,
     save_poses,
     save_rig,
+    scan_digest,
+    template_digest,
     write_capture_description,
     write_scan,
     write_truth_frame,
@@ -154,13 +157,58 @@ def test_poses_that_do_not_match_the_scans_are_named(capture: Capture):
         read_poses(capture)
 
 
-def test_the_digest_follows_what_a_stage_reads(capture: Capture):
-    before = capture_digest(capture)
-    assert capture_digest(read_capture(capture.path)) == before
-    save_poses(capture.path / "poses.npz", poses_of(FRAMES))
-    after_poses = capture_digest(capture)
-    write_mesh(capture.path / "scans" / "000012.ply", SQUARE)  # another size
-    assert len({before, after_poses, capture_digest(capture)}) == 3
+def test_the_digest_of_a_capture_follows_its_scans_and_its_description(capture: Capture):
+    digests = [capture_digest(capture)]
+    assert capture_digest(read_capture(capture.path)) == digests[0]
+    for name in ("poses.npz", "body.npz", "template.npz", "template.obj"):  # of registration, not of extraction
+        (capture.path / name).write_bytes(b"1")
+    assert capture_digest(capture) == digests[0]
+    path = capture.path / "scans" / "000012.ply"
+    path.write_bytes(path.read_bytes() + b" ")
+    digests.append(capture_digest(capture))
+    path.write_bytes(path.read_bytes()[:-1] + b"x")  # of the same size
+    digests.append(capture_digest(capture))
+    for text in ("map_Kd a.png", "map_Kd b.png"):
+        (capture.path / "scans" / "000012.mtl").write_text(text)
+        digests.append(capture_digest(capture))
+    (capture.path / "scans" / "Thumbs.db").write_text("nobody's business")
+    assert capture_digest(capture) == digests[-1]
+    write_capture_description(replace(capture, fps=30.0))
+    digests.append(capture_digest(capture))
+    assert len(set(digests)) == len(digests)
+
+
+@pytest.mark.parametrize("size", [0, 1, 65_536, 65_537, 131_072, 131_073, 200_000])
+def test_the_digest_of_a_scan_follows_its_ends(size: int, tmp_path: Path):
+    path, data = tmp_path / "000001.ply", bytes(size)
+    path.write_bytes(data)
+    digest = scan_digest(path)
+    for place in {0, size - 1} if size else {}:
+        path.write_bytes(data[:place] + b"x" + data[place + 1 :])
+        assert scan_digest(path) != digest
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".obj", ".ply", ".glb"])
+def test_a_template_of_any_format_has_a_digest(suffix: str, capture: Capture):
+    with pytest.raises(InputError, match="registration needs a template"):
+        template_digest(capture)
+    digests = set()
+    for text in ("one", "two"):
+        (capture.path / f"template{suffix}").write_text(text)
+        digests.add(template_digest(capture))
+    assert len(digests) == 2
+
+
+def test_motion_is_poses_and_the_body_they_move(capture: Capture):
+    (capture.path / "body.npz").write_text("one")
+    assert motion_digest(capture) is None
+    (capture.path / "poses.npz").write_text("poses")
+    digests = [motion_digest(capture)]
+    (capture.path / "body.npz").write_text("two")
+    digests.append(motion_digest(capture))
+    (capture.path / "body.npz").unlink()
+    digests.append(motion_digest(capture))
+    assert len(set(digests)) == 3
 
 
 def test_bodies_garments_and_rigs_come_back(tmp_path: Path):

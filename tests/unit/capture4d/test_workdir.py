@@ -131,6 +131,52 @@ def test_a_stage_resumes_with_the_same_digest(tmp_path: Path):
     assert require_complete(tmp_path / "halted", "test", "make") == whole
 
 
+def test_a_complete_stage_is_not_hashed_again_unless_something_was_written(tmp_path: Path):
+    stage = open_test_stage(tmp_path)
+    digest = finish_frames(stage)
+    paths = [stage.frame_path(frame_id) for frame_id in FRAMES]
+    write_npz(paths[0], value=np.zeros(1))  # behind its back
+    again = open_test_stage(tmp_path)
+    assert again.was_complete
+    assert again.finish(paths, changed=False) == digest
+    assert require_complete(tmp_path, "test", "make") == digest
+    assert open_test_stage(tmp_path).finish(paths) != digest
+    open_test_stage(tmp_path)  # and is killed
+    assert not open_test_stage(tmp_path).was_complete
+
+
+def test_frames_are_counted_by_their_files(tmp_path: Path):
+    stage = open_test_stage(tmp_path)
+    assert stage.count() == 0
+    finish_frames(stage)
+    (tmp_path / "frames" / ".000009.npz.x.partial").touch()
+    assert stage.count() == len(FRAMES)
+
+
+def test_a_stage_made_from_something_else_names_the_repair(tmp_path: Path):
+    finish_frames(open_test_stage(tmp_path, garment="aa"))
+    require_complete(tmp_path, "test", "make", made_from={"garment": "aa"})
+    with pytest.raises(InputError, match=r"from this garment as it is now.*run: make --overwrite"):
+        require_complete(tmp_path, "test", "make", made_from={"garment": "bb"})
+
+
+def test_a_stage_is_taken_over_by_inputs_that_stand_for_its_own(tmp_path: Path):
+    finish_frames(open_test_stage(tmp_path, garment="aa"))
+
+    def opened(now: str, formerly: str) -> Stage:
+        return open_stage(tmp_path, name="test", schema=1, config=Settings(), upstream={"garment": now},
+                          formerly={"garment": formerly})  # fmt: skip
+
+    with pytest.raises(InputError, match=r"upstream\.garment"):
+        opened("bb", "cc")
+    stage = opened("bb", "aa")
+    assert not stage.was_complete
+    assert not stage.pending(FRAMES)
+    assert opened("bb", "aa").pending(FRAMES) == [], "killed right after"
+    with pytest.raises(InputError, match=r"upstream\.garment"):
+        open_test_stage(tmp_path, garment="aa")
+
+
 def test_a_frame_cut_off_by_other_means_is_pending(tmp_path: Path):
     stage = open_test_stage(tmp_path / "stage")
     finish_frames(stage)

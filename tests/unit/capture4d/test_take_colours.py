@@ -1,0 +1,43 @@
+"""The borders of a garment, named alike whether its colours are given or learned."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from capture4d import take_colours
+from capture4d.border_loops import SHIRT
+from capture4d.colour_learning import Light
+from capture4d.take_colours import KnownColours, cut_out
+from capture4d.types import GarmentScan, Mesh, Scan
+from tests.unit.capture4d.test_border_loops import shirt
+
+
+@pytest.mark.parametrize("learned", [False, True])
+def test_borders_of_one_paint_are_separated_named_and_ordered(learned: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    loops = shirt(-50)
+    order = np.random.default_rng(0).permutation(sum(map(len, loops)))
+    points = np.concatenate(loops)[order].astype(np.float32)
+    mesh = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32))
+    unnamed = GarmentScan(mesh, points, np.full(len(points), -1, np.int32), SHIRT, 1)
+    monkeypatch.setattr(take_colours, "extract_garment", lambda *_, **__: unnamed)
+    monkeypatch.setattr(Light, "removed", lambda _, mesh, colours: colours)
+    paint = dict.fromkeys(SHIRT, (255, 210, 0))
+    light = Light(np.zeros((1, 3)), np.zeros(3), 1.0) if learned else None
+    colours = KnownColours((47, 98, 201), paint, SHIRT, light=light)
+    found = cut_out(Scan(mesh, np.zeros((3, 3), np.uint8), 1, 0.0), colours)
+    assert np.bincount(found.boundary_loops).tolist() == [len(loop) for loop in loops]
+    for index, loop in enumerate(loops):
+        own = found.boundary_points[found.boundary_loops == index]
+        assert np.linalg.norm(own - np.roll(own, 1, axis=0), axis=1).max() < 0.02, "in order around it"
+        assert np.linalg.norm(own.mean(axis=0) - loop.mean(axis=0)) < 1e-4
+
+
+def test_borders_that_their_paint_names_stay_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = np.concatenate(shirt(-50)).astype(np.float32)
+    mesh = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32))
+    named = GarmentScan(mesh, points, np.arange(len(points), dtype=np.int32) % 4, SHIRT, 1)
+    monkeypatch.setattr(take_colours, "extract_garment", lambda *_, **__: named)
+    paint = {name: (255, 210, index) for index, name in enumerate(SHIRT)}
+    scan = Scan(mesh, np.zeros((3, 3), np.uint8), 1, 0.0)
+    assert cut_out(scan, KnownColours((47, 98, 201), paint, SHIRT)) is named

@@ -1,0 +1,29 @@
+"""The body and the poses that move a template."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from capture4d.body_anny import load_anny
+from capture4d.records import save_body, save_poses
+from capture4d.scans import Capture
+from capture4d.types import PoseSequence
+from capture4d.work_folder import captured_motion
+
+
+def test_poses_without_a_body_move_the_built_in_one(tmp_path: Path) -> None:
+    capture, body = Capture(tmp_path, "take", 60.0, (3, 4), None), load_anny()
+    assert captured_motion(capture) == (None, None)
+    count = len(body.joint_names)
+    still = np.tile(np.eye(3, dtype=np.float32), (2, count, 1, 1))
+    ids = np.array([3, 4], np.int32)
+    poses = PoseSequence(still, np.zeros((2, 3), np.float32), np.zeros(1, np.float32), ids, 60.0, body.joint_names)
+    save_poses(tmp_path / "poses.npz", poses)
+    found, moved = captured_motion(capture)
+    assert found is not None
+    assert moved is not None
+    assert found.joint_names == body.joint_names
+    save_body(tmp_path / "body.npz", body)
+    assert captured_motion(capture)[0] is not None
