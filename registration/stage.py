@@ -2,7 +2,8 @@
 
 stage.json                what was run
 garment.npz               the template
-frames/000123.npz         vertices (V, 3) and residual_m (V,) float32, verdict (0 good, 1 check, 2 failed)
+frames/000123.npz         vertices (V, 3) float32, verdict (0 good, 1 check, 2 failed), and per vertex (V,) residual_m,
+                          border_error_m, stretch float32 and flipped bool, as in `FrameQuality`
 metrics/000123.json       the frame's numbers, reasons and CPU time
 vertices.npy              (T, V, 3) float32, all frames
 metrics.jsonl             the frames' metrics, one per line
@@ -192,7 +193,7 @@ def _write_frame(stage: Stage, result: FrameResult) -> None:
     write_npz(
         stage.frame_path(result.frame_id),
         vertices=result.vertices,
-        residual_m=result.quality.residual_m.astype(np.float32),
+        **result.quality.vertex_arrays(),
         verdict=np.uint8(VERDICTS.index(result.quality.verdict)),
     )
 
