@@ -155,7 +155,8 @@ def survey_take(probes: Sequence[Mesh], declared: float, motion: Motion | None =
     size = float(np.median([np.sqrt(_area(mesh)) for mesh in probes]))
     ratio = size * declared / SUBJECT_SIZE_M
     size_ratio = max(ratio, 1 / max(ratio, 1e-12))
-    units, scale = next((name for name, metres in METRES.items() if metres == declared), None), declared
+    units: Units | None = next((name for name, metres in METRES.items() if metres == declared), None)
+    scale = declared
     if size_ratio > MAX_SIZE_RATIO:
         units, left = find_units(size)
         scale = METRES[units]
@@ -261,8 +262,8 @@ def find_units(size: float) -> tuple[Units, float]:
     Returns:
         The unit, and the ratio of the size in it to that of a person, never below 1.
     """
-    ratios = {unit: size * metres / SUBJECT_SIZE_M for unit, metres in METRES.items()}
-    unit = min(ratios, key=lambda name: abs(np.log(max(ratios[name], 1e-12))))
+    ratios: dict[Units, float] = {unit: size * metres / SUBJECT_SIZE_M for unit, metres in METRES.items()}
+    unit, _ = min(ratios.items(), key=lambda item: abs(np.log(max(item[1], 1e-12))))
     return unit, float(np.exp(abs(np.log(max(ratios[unit], 1e-12)))))
 
 
