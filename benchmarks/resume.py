@@ -20,6 +20,8 @@ from capture4d.scans import read_capture
 from capture4d.workdir import read_json
 
 STAGES, TRACKED = ("garment", "registration"), ("garment", "body", "registration")
+DELAY_S = 0.5
+"""Longer than a frame takes, so that kills fall between frames, into frames, and between stages."""
 
 
 def run(
@@ -36,7 +38,8 @@ def run(
     Args:
         quick: three kills instead of ten.
         capture: capture folder to run on; a tiny synthetic one if absent.
-        kills: how often, each time on a fresh work folder, at a moment anywhere between start and end.
+        kills: how often, each time on a fresh work folder. The moments are spread over the work, not over time: so many
+            files of frames are there, and up to half a second has passed.
         track: track the body as well, which takes most of the time; its digest is compared too.
         workers: processes of the killed run, which die with it.
         seed: of the moments.
@@ -52,16 +55,16 @@ def run(
             _command("synth", capture, "--preset", "tiny", "--workers", workers)
         frames = len(read_capture(capture).frame_ids)
 
-        started = time.perf_counter()
         _run_to_the_end(capture, folder / "whole", workers, options)
-        whole = time.perf_counter() - started
         expected = _digests(folder / "whole", stages)
 
         same = interrupted = 0
         for trial in range(trials):
             work = folder / "killed"
-            alive = _kill_after(moments.uniform(0.0, whole), capture, work, workers, options)
-            done = len(list(work.glob("*/frames/*.npz")))
+            share = (trial + moments.random()) / trials
+            files, seconds = int(share * len(stages) * frames), moments.uniform(0.0, DELAY_S)
+            alive = _kill_after(files, seconds, capture, work, workers, options)
+            done = _frames_done(work)
             _run_to_the_end(capture, work, workers, options)
             found = _digests(work, stages)
             same += found == expected
@@ -88,13 +91,15 @@ def _run_to_the_end(capture: Path, work: Path, workers: int, options: Sequence[s
     _command("run", capture, "--output", work, "--workers", workers, *options)
 
 
-def _kill_after(seconds: float, capture: Path, work: Path, workers: int, options: Sequence[str]) -> bool:
-    """Start a run and kill it, and only it, after a time; whether it was still at work."""
+def _kill_after(files: int, seconds: float, capture: Path, work: Path, workers: int, options: Sequence[str]) -> bool:
+    """Start a run and kill it, and only it, a time after it has written so many frames; whether it was at work."""
     process = subprocess.Popen(
         _arguments("run", capture, "--output", work, "--workers", workers, *options),
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
+    while process.poll() is None and _frames_done(work) < files:
+        time.sleep(0.005)
     try:
         process.wait(timeout=seconds)
     except subprocess.TimeoutExpired:
@@ -102,6 +107,10 @@ def _kill_after(seconds: float, capture: Path, work: Path, workers: int, options
         process.wait()
         return True
     return False
+
+
+def _frames_done(work: Path) -> int:
+    return len(list(work.glob("*/frames/*.npz")))
 
 
 def _digests(work: Path, stages: Sequence[str]) -> list[str]:
