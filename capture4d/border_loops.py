@@ -16,6 +16,10 @@ GAPS_M = (0.012, 0.02, 0.03, 0.045, 0.06)
 """Gaps in a border that are bridged, tried in turn."""
 MIN_EXTENT_M = 0.08
 """Smaller groups of points are no loop of a garment."""
+MAX_STRAYS = 0.1
+"""Share of the points beside the loops above which the loops are pieces of loops."""
+MAX_GAP_DEG = 100.0
+"""Largest opening of a loop, seen from its middle; half a circle has 115."""
 MIN_TILT = 0.15
 """Sine of the slope of a neckline from back to front below which it does not tell front from back."""
 
@@ -58,12 +62,23 @@ def separate_loops(points: Float[np.ndarray, "points 3"], count: int) -> Int64[n
     return np.full(len(points), -1)
 
 
-def loop_order(points: Float[np.ndarray, "points 3"]) -> Int64[np.ndarray, " points"]:
-    """Points in order around the middle of their loop, seen along its axis, counter-clockwise from above."""
+def _around(points: np.ndarray) -> Float64[np.ndarray, " points"]:
+    """Angle of each point about the middle of its loop, seen along its axis, counter-clockwise from above."""
     centred = points - points.mean(axis=0)
     _, _, axes = np.linalg.svd(centred, full_matrices=False)
     right, up = axes[0], np.cross(axes[2] * np.sign(axes[2][1] or 1.0), axes[0])
-    return np.argsort(np.arctan2(centred @ up, centred @ right), kind="stable")
+    return np.arctan2(centred @ up, centred @ right)
+
+
+def _opening_deg(points: np.ndarray) -> float:
+    """The largest angle about the middle without a point."""
+    angles = np.sort(_around(points))
+    return float(np.degrees(np.diff(angles, append=angles[0] + 2 * np.pi).max()))
+
+
+def loop_order(points: Float[np.ndarray, "points 3"]) -> Int64[np.ndarray, " points"]:
+    """Points in order around the middle of their loop, seen along its axis, counter-clockwise from above."""
+    return np.argsort(_around(points), kind="stable")
 
 
 def _length(points: np.ndarray) -> float:
@@ -75,16 +90,17 @@ def _length(points: np.ndarray) -> float:
 def name_shirt_loops(points: Float[np.ndarray, "points 3"], names: Sequence[str]) -> Int32[np.ndarray, " points"]:
     """The index in `names` of the loop that each point is on, -1 where its shape does not tell.
 
-    The hem is the longest loop; of the other three the two farthest apart are the cuffs. The neckline is lower in
-    front, which tells left from right.
+    All four loops have to be there nearly whole: where arms hide pieces of them, what is left has other shapes. The hem
+    is the longest loop; of the other three the two farthest apart are the cuffs. The neckline is lower in front, which
+    tells left from right.
     """
     unknown = np.full(len(points), -1, np.int32)
     if sorted(names) != sorted(SHIRT) or not len(points):
         return unknown
     loop = separate_loops(points, len(SHIRT))
-    if (loop < 0).all():
-        return unknown
     members: list[Bool[np.ndarray, " points"]] = [loop == index for index in range(len(SHIRT))]
+    if (loop < 0).mean() > MAX_STRAYS or max(_opening_deg(points[own]) for own in members) > MAX_GAP_DEG:
+        return unknown
     middles = [points[own].mean(axis=0) for own in members]
     pairs = [(1, 2, 3), (1, 3, 2), (2, 3, 1)]
     one, other, neck = max(pairs, key=lambda pair: float(np.linalg.norm(middles[pair[0]] - middles[pair[1]])))
