@@ -64,7 +64,7 @@ def separate_loops(points: Float[np.ndarray, "points 3"], count: int) -> Int64[n
 
 def _around(points: np.ndarray) -> Float64[np.ndarray, " points"]:
     """Angle of each point about the middle of its loop, seen along its axis, counter-clockwise from above."""
-    centred = points - points.mean(axis=0)
+    centred = np.asarray(points, np.float64) - points.mean(axis=0)
     _, _, axes = np.linalg.svd(centred, full_matrices=False)
     right, up = axes[0], np.cross(axes[2] * np.sign(axes[2][1] or 1.0), axes[0])
     return np.arctan2(centred @ up, centred @ right)

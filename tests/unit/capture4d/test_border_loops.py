@@ -48,6 +48,15 @@ def test_what_is_not_a_shirt_or_has_a_level_neck_is_not_guessed() -> None:
     assert set(named.tolist()) == {-1, 0, 1}
 
 
+def test_pieces_of_loops_are_not_named() -> None:
+    neck, hem, left, right = shirt(-50)
+    halves = hem[(np.arange(240) % 120) > 20]  # two pieces; the right cuff is out of sight, so there are four curves again
+    assert (separate_loops(np.concatenate([neck, halves, left]), 4) >= 0).all()
+    assert (name_shirt_loops(np.concatenate([neck, halves, left]), SHIRT) == -1).all()
+    crumbs = hem[(np.arange(240) % 24) > 11]  # pieces of 6 cm, too short for loops
+    assert (name_shirt_loops(np.concatenate([crumbs, hem[100:139], neck, left, right]), SHIRT) == -1).all()
+
+
 def test_loops_are_separated_across_small_holes_and_strays_are_left_out() -> None:
     first, second = ring((0, 0, 0), (0, 1, 0), 0.2, 300), ring((0, 0.3, 0), (0, 1, 0), 0.1, 150)
     stray = np.array([[0.0, 0.15, 0.0]])
