@@ -6,6 +6,7 @@ rest pose onto the source's, so that bone lengths and rest poses may differ.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -139,10 +140,10 @@ def retarget(
         first_frame: where to start, in frames of the result.
         place: `origin` turns the clip to face +Z and starts it above the origin; `world` leaves it where it is.
     Raises:
-        InputError: the file's joint names follow none of the known schemes, or the body's are not the built-in body's.
+        InputError: the file's joint names follow none of the known schemes, or the body lacks limbs that it drives.
     """
     scheme = _match(bvh)
-    _require_joints(shaped, scheme)
+    _require_joints(shaped, {*scheme.limbs, "foot.L"})
     world = bvh.world_rotations()
     duration = (len(world) - 1) * bvh.frame_time_s
     at = np.arange(first_frame / fps, duration + 0.1 / fps, 1 / fps)  # files round their frame time
@@ -179,7 +180,7 @@ def as_smpl(shaped: ShapedBody, poses: PoseSequence) -> Bvh:
     """
     names = list(shaped.body.joint_names)
     scheme, tree = SCHEMES[0], list(SMPL_TREE)
-    _require_joints(shaped, scheme)
+    _require_joints(shaped, scheme.drives)
     source = Bvh(
         Path("SMPL"),
         tuple(tree),
@@ -212,8 +213,8 @@ def as_smpl(shaped: ShapedBody, poses: PoseSequence) -> Bvh:
     )
 
 
-def _require_joints(shaped: ShapedBody, scheme: _Scheme) -> None:
-    missing = sorted(set(scheme.drives) - set(shaped.body.joint_names))
+def _require_joints(shaped: ShapedBody, names: Iterable[str]) -> None:
+    missing = sorted(set(names) - set(shaped.body.joint_names))
     if missing:
         raise InputError(f"body: expected joints named as the built-in body's, found none called {missing[0]}")
 

@@ -122,7 +122,7 @@ def cut_out(scan: Scan, colours: KnownColours, *, source: str = "scan") -> Garme
     garment = extract_garment(
         colours.flat(scan), colours.garment, colours.boundary, other_colours=colours.others, source=source
     )
-    if colours.light is None and (garment.boundary_loops >= 0).any():
+    if colours.light is None:
         return garment
     if colours.loop_names != garment.loop_names:
         unknown = np.full(len(garment.boundary_points), -1, np.int32)

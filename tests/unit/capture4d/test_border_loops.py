@@ -50,7 +50,7 @@ def test_what_is_not_a_shirt_or_has_a_level_neck_is_not_guessed() -> None:
 
 def test_pieces_of_loops_are_not_named() -> None:
     neck, hem, left, right = shirt(-50)
-    halves = hem[(np.arange(240) % 120) > 20]  # two pieces; the right cuff is out of sight, so there are four curves again
+    halves = hem[(np.arange(240) % 120) > 20]  # two pieces, and no right cuff: four curves again
     assert (separate_loops(np.concatenate([neck, halves, left]), 4) >= 0).all()
     assert (name_shirt_loops(np.concatenate([neck, halves, left]), SHIRT) == -1).all()
     crumbs = hem[(np.arange(240) % 24) > 11]  # pieces of 6 cm, too short for loops

@@ -237,7 +237,7 @@ def test_what_is_no_motion_is_named(tmp_path: Path) -> None:
 
 def test_a_body_without_the_joints_that_a_motion_drives_is_named() -> None:
     body, source = load_anny(), cmu_clip(*NAMINGS[0], 0)
-    for missing in ("upperleg01.L", "lowerarm01.R", "head"):
+    for missing in ("upperleg01.L", "lowerarm01.R", "foot.L"):
         names = tuple(name.replace(missing, "other") for name in body.joint_names)
         shaped = with_shape(replace(body, joint_names=names), np.zeros(0, np.float32))
         with pytest.raises(InputError, match=f"found none called {missing}"):

@@ -1,4 +1,4 @@
-"""The borders of a garment, named alike whether its colours are given or learned."""
+"""The borders of a garment whose colours are learned, named by their shape."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ from capture4d.types import GarmentScan, Mesh, Scan
 from tests.unit.capture4d.test_border_loops import shirt
 
 
-@pytest.mark.parametrize("learned", [False, True])
-def test_borders_of_one_paint_are_separated_named_and_ordered(learned: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_borders_of_one_learned_paint_are_separated_named_and_ordered(monkeypatch: pytest.MonkeyPatch) -> None:
     loops = shirt(-50)
     order = np.random.default_rng(0).permutation(sum(map(len, loops)))
     points = np.concatenate(loops)[order].astype(np.float32)
@@ -23,8 +22,7 @@ def test_borders_of_one_paint_are_separated_named_and_ordered(learned: bool, mon
     monkeypatch.setattr(take_colours, "extract_garment", lambda *_, **__: unnamed)
     monkeypatch.setattr(Light, "removed", lambda _, mesh, colours: colours)
     paint = dict.fromkeys(SHIRT, (255, 210, 0))
-    light = Light(np.zeros((1, 3)), np.zeros(3), 1.0) if learned else None
-    colours = KnownColours((47, 98, 201), paint, SHIRT, light=light)
+    colours = KnownColours((47, 98, 201), paint, SHIRT, light=Light(np.zeros((1, 3)), np.zeros(3), 1.0))
     found = cut_out(Scan(mesh, np.zeros((3, 3), np.uint8), 1, 0.0), colours)
     assert np.bincount(found.boundary_loops).tolist() == [len(loop) for loop in loops]
     for index, loop in enumerate(loops):
@@ -33,7 +31,7 @@ def test_borders_of_one_paint_are_separated_named_and_ordered(learned: bool, mon
         assert np.linalg.norm(own.mean(axis=0) - loop.mean(axis=0)) < 1e-4
 
 
-def test_borders_that_their_paint_names_stay_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_borders_of_given_paints_stay_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
     points = np.concatenate(shirt(-50)).astype(np.float32)
     mesh = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32))
     named = GarmentScan(mesh, points, np.arange(len(points), dtype=np.int32) % 4, SHIRT, 1)

@@ -39,12 +39,11 @@ def sphere(radius: float, colour: tuple[int, int, int], label: int, *, band: flo
     row, column = np.divmod(np.arange(89 * 120), 120)
     a, b = row * 120 + column, row * 120 + (column + 1) % 120
     faces = np.concatenate([np.stack([a, b, b + 120], 1), np.stack([a, b + 120, a + 120], 1)])
-    colours = np.where(vertices[:, 1:2] < -radius / 2 + band, (255, 196, 0), colour).astype(np.uint8)
+    painted = (vertices[:, 1] < -radius / 2 + band) & (band > 0)
+    colours = np.where(painted[:, None], (255, 196, 0), colour).astype(np.uint8)
     if band:
         faces = faces[(vertices[faces, 1] >= -radius / 2).all(axis=1)]
-    else:
-        colours[:] = colour
-    return Surface(Mesh(vertices.astype(np.float32), faces.astype(np.int32)), colours, label, 0.005)
+    return Surface(Mesh(vertices.astype(np.float32), faces.astype(np.int32)), colours, label, 0.005, painted)
 
 
 def front_pod(distance: float) -> Rig:
