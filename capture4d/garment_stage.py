@@ -28,7 +28,7 @@ from capture4d.workdir import Stage, open_stage, run_jobs, write_json, write_npz
 
 __all__ = ["flagged_frames", "load_garment_scan", "run", "save_garment_scan"]
 
-SCHEMA = 3
+SCHEMA = 4
 
 
 @dataclass(frozen=True, slots=True)
