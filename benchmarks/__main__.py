@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import os
 import pkgutil
 import sys
 import time
@@ -34,6 +35,9 @@ class Outlet:
 
 
 def main(arguments: list[str]) -> int:
+    # One thread for linear algebra, as in the command: on small matrices several wait for each other, and their waiting
+    # counts as CPU time. numpy reads this as it loads, which is later.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     names = _names()
     if arguments == ["--list"]:
         print("\n".join(names))
