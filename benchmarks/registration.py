@@ -29,6 +29,7 @@ from scipy.spatial import KDTree
 from benchmarks.memory import peak_rss_mb
 from benchmarks.metric import Metric
 from benchmarks.peers import PEERS, run_peer
+from capture4d.atomic_files import read_json
 from capture4d.evaluation import (
     border_errors,
     correspondence_errors,
@@ -51,7 +52,6 @@ from capture4d.scans import (
     write_capture_description,
 )
 from capture4d.types import Garment, GarmentScan, Mesh
-from capture4d.workdir import read_json
 from registration.config import PAPER, MeshRegistrationConfig, RegistrationConfig
 from registration.register import prepare_frame, register_frame
 from registration.register_mesh import register_mesh

@@ -35,6 +35,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.dressed_body import covered_vertices, dress_body, sample_scan
 from benchmarks.metric import Metric
+from capture4d.atomic_files import read_json
 from capture4d.body import PosedBody, ShapedBody, pose_frame, with_pose, with_shape
 from capture4d.body_anny import load_anny
 from capture4d.body_sequence import Followed, Tracker
@@ -48,7 +49,6 @@ from capture4d.motion_retarget import retarget
 from capture4d.records import ArrayFile, load_poses, save_body
 from capture4d.scans import Capture, read_capture, read_scan, save_poses, write_capture_description, write_scan
 from capture4d.types import Body, PoseSequence
-from capture4d.workdir import read_json
 
 MOCAP = Path(__file__).resolve().parents[2] / "shared" / "data" / "mocap" / "cmu_131_03_start_hop_stop.bvh"
 JOINTS = (

@@ -29,7 +29,7 @@ LIMBS: tuple[tuple[tuple[str, str], ...], ...] = (
 )
 """The parts of each limb from the trunk outwards, and what their joints are called, in lower case."""
 LEG = tuple(part for part, _ in LIMBS[2])
-OUT_OF_VIEW = 0.95
+OUT_OF_VIEW = 0.8
 """Legs that so many frames lack are outside of what the rig looks at."""
 
 

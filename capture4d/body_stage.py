@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from capture4d.atomic_files import file_digest, read_json, write_bytes, write_json, write_npz
 from capture4d.body_anny import load_anny
 from capture4d.body_limbs import guessed_limbs, unseen_limbs
 from capture4d.body_sequence import NOTHING, Followed, Quality, Refined, Tracker, between, outlying
@@ -35,17 +36,8 @@ from capture4d.scan_points import scan_points
 from capture4d.scans import Capture, body_digest, capture_digest, read_body, read_capture, read_scan, scan_path
 from capture4d.take_colours import forget_learned_colours, take_colours
 from capture4d.types import Body, PoseSequence
-from capture4d.workdir import (
-    Stage,
-    file_digest,
-    open_stage,
-    read_json,
-    require_complete,
-    run_jobs,
-    write_bytes,
-    write_json,
-    write_npz,
-)
+from capture4d.workdir import Stage, open_stage, require_complete
+from capture4d.workers import run_jobs
 
 __all__ = ["load_tracking", "run", "tracking_digest"]
 

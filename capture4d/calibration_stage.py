@@ -14,6 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from capture4d.atomic_files import read_json, write_json, write_npz
 from capture4d.calibration_board import Board, BoardView, parse_board
 from capture4d.calibration_config import CALIBRATION, RIG_CHECK, CalibrationConfig, RigCheckConfig
 from capture4d.calibration_report import calibration_report
@@ -24,7 +25,7 @@ from capture4d.records import ArrayFile, load_rig, save_rig
 from capture4d.rig_calibration import calibrate_rig
 from capture4d.rig_check import CameraCheck, check_rig
 from capture4d.rig_uncertainty import CAMERA_UNKNOWNS
-from capture4d.workdir import read_json, run_jobs, write_json, write_npz
+from capture4d.workers import run_jobs
 
 __all__ = ["BoardImage", "convert", "find_images", "run", "run_check"]
 

@@ -18,13 +18,15 @@ from typing import Any
 
 import numpy as np
 
+from capture4d.atomic_files import write_json, write_npz
 from capture4d.errors import InputError
 from capture4d.garment_extraction import ColourNotFoundError
 from capture4d.records import ArrayFile
 from capture4d.scans import Capture, capture_digest, format_colour, read_capture, read_scan, scan_digest, scan_path
 from capture4d.take_colours import KnownColours, cut_out, forget_learned_colours, take_colours, template_loops
 from capture4d.types import GarmentScan, Mesh
-from capture4d.workdir import Stage, open_stage, run_jobs, write_json, write_npz
+from capture4d.workdir import Stage, open_stage
+from capture4d.workers import run_jobs
 
 __all__ = ["flagged_frames", "load_garment_scan", "run", "save_garment_scan"]
 

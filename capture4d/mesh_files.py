@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int32, UInt8
 
+from capture4d.atomic_files import write_bytes
 from capture4d.errors import EmptyMeshError, InputError
 from capture4d.obj_format import obj_bytes, read_obj
 from capture4d.ply_format import ply_bytes, read_ply
 from capture4d.polygons import MeshFile
 from capture4d.textures import texture_colours
 from capture4d.types import Mesh
-from capture4d.workdir import write_bytes
 
 __all__ = ["MESH_SUFFIXES", "MeshFile", "read_coloured_mesh", "read_mesh", "write_mesh"]
 

@@ -20,13 +20,13 @@ import numpy as np
 from jaxtyping import Float, Float64
 from scipy.spatial.transform import Rotation, Slerp
 
+from capture4d.atomic_files import write_bytes, write_npz
 from capture4d.body import ShapedBody, with_shape
 from capture4d.bvh_format import Bvh, format_bvh, read_bvh
 from capture4d.errors import InputError
 from capture4d.motion_retarget import SMPL_TREE, as_smpl, retarget
 from capture4d.records import ArrayFile, load_poses, save_poses
 from capture4d.types import Body, PoseSequence
-from capture4d.workdir import write_bytes, write_npz
 
 __all__ = ["read_motion", "resample", "write_amass", "write_bvh", "write_motion"]
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from capture4d.atomic_files import read_json, write_json, write_npz
 from capture4d.errors import InputError
 from capture4d.types import Body, Garment, Mesh, PoseSequence, Rig
-from capture4d.workdir import read_json, write_json, write_npz
 
 __all__ = [
     "ArrayFile",

@@ -22,6 +22,7 @@ from typing import Literal, get_args
 import numpy as np
 from jaxtyping import Float32, Int32, UInt8
 
+from capture4d.atomic_files import file_digest, read_json, write_json, write_npz
 from capture4d.colours import Colour, format_colour, parse_colour
 from capture4d.errors import InputError
 from capture4d.mesh import boundary_loops
@@ -39,7 +40,6 @@ from capture4d.records import (
     save_rig,
 )
 from capture4d.types import Body, Garment, Mesh, PoseSequence, Rig, Scan
-from capture4d.workdir import file_digest, read_json, write_json, write_npz
 
 __all__ = [
     "METRES",

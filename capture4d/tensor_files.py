@@ -12,8 +12,8 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
+from capture4d.atomic_files import write_bytes
 from capture4d.errors import InputError
-from capture4d.workdir import write_bytes
 
 __all__ = ["TensorFile", "read_tensors", "write_tensors"]
 

@@ -13,13 +13,14 @@ from typing import Any
 
 import numpy as np
 
+from capture4d.atomic_files import read_json, write_npy_rows
 from capture4d.body_anny import load_anny
 from capture4d.body_stage import load_tracking
 from capture4d.errors import InputError
 from capture4d.records import load_garment
 from capture4d.scans import Capture, read_body, read_capture, read_poses
 from capture4d.types import Body, PoseSequence, RegisteredSequence
-from capture4d.workdir import Stage, read_json, write_npy_rows
+from capture4d.workdir import Stage
 
 __all__ = [
     "ANIMATE",

@@ -1,4 +1,4 @@
-"""Output that survives a crash: atomic files, stages that resume, and a pool of local workers.
+"""Stages that survive a crash: folders that resume, and refuse to go on with other settings.
 
 A stage is a folder with a `stage.json` and one file per frame. A file either exists whole or does not exist, so the
 work that is left after a crash is the files that are missing, and the same command finishes it with the same result.
@@ -7,165 +7,20 @@ A stage remembers its settings and the digests of what it was made from, and ref
 
 from __future__ import annotations
 
-import contextlib
-import dataclasses
-import hashlib
-import io
 import json
-import multiprocessing
 import os
 import shutil
-import signal
-import tempfile
-import threading
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from multiprocessing.connection import wait
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-import numpy as np
-
+from capture4d.atomic_files import TEMPORARY_SUFFIX, file_digest, plain_value, read_json, write_json
 from capture4d.errors import InputError
 
-__all__ = [
-    "Stage",
-    "WorkerDied",
-    "file_digest",
-    "open_stage",
-    "progress",
-    "read_json",
-    "require_complete",
-    "run_jobs",
-    "write_bytes",
-    "write_chunks",
-    "write_json",
-    "write_npy",
-    "write_npy_rows",
-    "write_npz",
-]
-
-_TEMPORARY_SUFFIX = ".partial"
-
-Job = TypeVar("Job")
-Result = TypeVar("Result")
-
-
-# --- files -------------------------------------------------------------------------------------------------------
-
-
-def write_bytes(path: str | Path, data: bytes) -> None:
-    """Write a file so that it is there whole or not at all, even if the process is killed.
-
-    Raises:
-        OSError: the disk is full or read-only; names the file. What stood at `path` before still stands.
-    """
-    write_chunks(path, [data])
-
-
-def write_chunks(path: str | Path, chunks: Iterable[bytes | memoryview]) -> None:
-    """`write_bytes` for more than memory should hold at once."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=_TEMPORARY_SUFFIX, dir=path.parent)
-        try:
-            with os.fdopen(handle, "wb") as file:
-                for chunk in chunks:
-                    file.write(chunk)
-                file.flush()
-                os.fsync(file.fileno())
-            os.chmod(temporary, 0o666 & ~_UMASK)
-            os.replace(temporary, path)
-        except BaseException:
-            with contextlib.suppress(FileNotFoundError):
-                os.unlink(temporary)
-            raise
-    except OSError as error:
-        raise OSError(error.errno, error.strerror or str(error), str(path)) from error
-
-
-def _current_umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
-
-
-_UMASK = _current_umask()
-
-
-def write_json(path: str | Path, value: Any) -> None:
-    """Write JSON for people to read, atomically. NaN is not JSON and raises ValueError."""
-    write_bytes(path, (json.dumps(value, indent=2, allow_nan=False, default=_plain) + "\n").encode())
-
-
-def write_npy(path: str | Path, array: np.ndarray) -> None:
-    """Write one array, atomically."""
-    buffer = io.BytesIO()
-    np.save(buffer, array, allow_pickle=False)
-    write_bytes(path, buffer.getvalue())
-
-
-def write_npy_rows(path: str | Path, rows: Iterable[np.ndarray], *, count: int) -> None:
-    """Write one array of `count` rows of equal shape and type, atomically, holding one row in memory at a time."""
-
-    def chunks() -> Iterator[bytes | memoryview]:
-        for index, row in enumerate(rows):
-            if index == 0:
-                header = io.BytesIO()
-                described = np.lib.format.header_data_from_array_1_0(row)
-                np.lib.format.write_array_header_1_0(
-                    header, {**described, "fortran_order": False, "shape": (count, *row.shape)}
-                )
-                yield header.getvalue()
-            yield np.ascontiguousarray(row).tobytes()
-
-    write_chunks(path, chunks())
-
-
-def write_npz(path: str | Path, **arrays: Any) -> None:
-    """Write named arrays, uncompressed and atomically. Equal arrays give equal bytes."""
-    buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **arrays)
-    write_bytes(path, buffer.getvalue())
-
-
-def read_json(path: str | Path) -> Any:
-    """Read JSON; a missing or damaged file is an InputError that names it."""
-    path = Path(path)
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid JSON ({error})") from None
-
-
-def file_digest(paths: Iterable[Path], *, root: Path) -> str:
-    """SHA-256 over the names (relative to `root`) and contents of files, whatever order they come in."""
-    total = hashlib.sha256()
-    for name, path in sorted((path.relative_to(root).as_posix(), path) for path in paths):
-        with path.open("rb") as file:
-            total.update(f"{name}\0{hashlib.file_digest(file, 'sha256').hexdigest()}\n".encode())
-    return total.hexdigest()
-
-
-def _plain(value: Any) -> Any:
-    """What json.dumps does not know: configs, numpy scalars and arrays, paths."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return dataclasses.asdict(value)
-    if isinstance(value, (np.ndarray, np.generic)):
-        return value.tolist()
-    if isinstance(value, Path):
-        return str(value)
-    raise TypeError(f"{type(value).__name__} has no JSON form")
-
-
-# --- stages ------------------------------------------------------------------------------------------------------
+__all__ = ["Stage", "open_stage", "require_complete"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -215,7 +70,7 @@ class Stage:
         if self._earlier is not None and not changed and all(path.is_file() for path in paths):
             write_json(self.path / "stage.json", {**self._earlier, "sources": self._record["sources"]})
             return self._earlier["digest"]
-        for leftover in self.path.rglob(f".*{_TEMPORARY_SUFFIX}"):
+        for leftover in self.path.rglob(f".*{TEMPORARY_SUFFIX}"):
             leftover.unlink(missing_ok=True)
         digest = file_digest(paths, root=self.path)
         finished = {**self._record, "status": "complete", "digest": digest, "finished": _now()}
@@ -252,7 +107,7 @@ def open_stage(
     settings = {
         "stage": name,
         "schema": schema,
-        "config": json.loads(json.dumps(config, default=_plain)),
+        "config": json.loads(json.dumps(config, default=plain_value)),
         "upstream": dict(upstream),
     }
     if folder.exists() and not folder.is_dir():
@@ -325,7 +180,7 @@ def _short(value: Any) -> str:
 
 def _is_blank(folder: Path) -> bool:
     """Nothing in it but folders and the temporary files of a run that was killed before its first file."""
-    return not any(path.is_file() and path.suffix != _TEMPORARY_SUFFIX for path in folder.rglob("*"))
+    return not any(path.is_file() and path.suffix != TEMPORARY_SUFFIX for path in folder.rglob("*"))
 
 
 def _discard(folder: Path, record: dict[str, Any]) -> None:
@@ -350,146 +205,3 @@ def _is_whole(path: Path) -> bool:
 
 def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
-
-
-# --- workers -----------------------------------------------------------------------------------------------------
-
-
-class WorkerDied(RuntimeError):
-    """A worker process ended without an answer: killed, or out of memory. Finished frames are on disk."""
-
-
-def run_jobs(
-    function: Callable[[Job], Result],
-    jobs: Sequence[Job],
-    *,
-    workers: int,
-    label: str,
-    units: Callable[[Job], int] | None = None,
-    finished: Callable[[], int] | None = None,
-) -> Iterator[Result]:
-    """Run `function` on every job and yield the results as they come, with a progress bar on stderr.
-
-    Args:
-        function: importable by name, as are its jobs and results, for they travel to new processes.
-        workers: processes; 1 runs the jobs here, in order. Each worker computes on one thread, so that results do not
-            depend on how many there are.
-        units: how much of the progress a job is worth, 1 each if None.
-        finished: units done so far, read from disk once a second; for jobs that are worth many.
-    Raises:
-        WorkerDied: a worker was killed.
-    """
-    if not jobs:
-        return
-    total = sum(units(job) if units else 1 for job in jobs)
-    with progress(label, total, finished) as advance:
-        if workers <= 1 or len(jobs) <= 1:
-            for job in jobs:
-                result = function(job)
-                advance(units(job) if units else 1)
-                yield result
-            return
-        before = set(multiprocessing.active_children())
-        pool = ProcessPoolExecutor(
-            min(workers, len(jobs)), multiprocessing.get_context("spawn"), initializer=_start_worker
-        )
-        try:
-            with _worker_environment():
-                futures: dict[Future[Result], Job] = {pool.submit(function, job): job for job in jobs}
-            for future in as_completed(futures):
-                result = future.result()
-                advance(units(futures[future]) if units else 1)
-                yield result
-        except BaseException as error:
-            for worker in set(multiprocessing.active_children()) - before:
-                worker.kill()  # files are whole or absent, so there is nothing to wait for
-            if isinstance(error, BrokenProcessPool):
-                raise WorkerDied(
-                    f"{label}: a worker process was killed, perhaps for want of memory; finished frames are kept, "
-                    "the same command goes on (with fewer --workers if memory is short)"
-                ) from None
-            raise
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
-
-
-@contextlib.contextmanager
-def _worker_environment() -> Iterator[None]:
-    """Processes started meanwhile leave Ctrl-C to this one, and compute on one thread.
-
-    Numerical libraries read these variables as they load; an ignored signal is inherited.
-    """
-    variables = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-    before = {name: os.environ.get(name) for name in variables}
-    os.environ.update(dict.fromkeys(variables, "1"))
-    on_main_thread = threading.current_thread() is threading.main_thread()
-    answer = signal.signal(signal.SIGINT, signal.SIG_IGN) if on_main_thread else None
-    try:
-        yield
-    finally:
-        if on_main_thread:
-            signal.signal(signal.SIGINT, answer)
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
-
-
-def _start_worker() -> None:
-    """End with the parent, however it ends."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def end_with_parent() -> None:
-        wait([parent.sentinel])
-        os._exit(1)
-
-    threading.Thread(target=end_with_parent, daemon=True).start()
-
-
-@contextlib.contextmanager
-def progress(
-    label: str, total: int, finished: Callable[[], int] | None = None, *, completed: int = 0
-) -> Iterator[Callable[[int], None]]:
-    """A progress bar with the time left, on stderr; call what it yields with the units just done.
-
-    Args:
-        finished: units done so far, read from disk once a second, instead of calls.
-        completed: units that were done before.
-    """
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    columns = (
-        TextColumn("{task.description:<24}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-    )
-    stop = threading.Event()
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        task = bar.add_task(label, total=total, completed=completed)
-        before = finished() if finished else 0
-
-        def poll() -> None:
-            while finished and not stop.wait(1.0):
-                bar.update(task, completed=min(finished() - before, total))
-
-        poller = threading.Thread(target=poll, daemon=True)
-        poller.start()
-        try:
-            yield lambda count: None if finished else bar.advance(task, count)
-            bar.update(task, completed=total)
-        finally:
-            stop.set()
-            poller.join()

@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from capture4d.atomic_files import write_bytes, write_json
 from capture4d.mesh import vertex_normals
 from capture4d.mesh_files import write_mesh
 from capture4d.ply_format import ply_bytes
 from capture4d.records import save_body, save_poses, save_rig
 from capture4d.scan_placement import Placement, place_rig
 from capture4d.types import Mesh, Scan
-from capture4d.workdir import write_bytes, write_json
 from data_synth.plain_takes import PlainTake
 
 __all__ = [

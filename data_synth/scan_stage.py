@@ -14,6 +14,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 
+from capture4d.atomic_files import file_digest
 from capture4d.errors import InputError
 from capture4d.evaluation import closest_points
 from capture4d.mesh import boundary_loops
@@ -33,7 +34,8 @@ from capture4d.scans import (
     write_truth_model,
 )
 from capture4d.types import Garment, Mesh
-from capture4d.workdir import Stage, file_digest, open_stage, run_jobs
+from capture4d.workdir import Stage, open_stage
+from capture4d.workers import run_jobs
 from data_synth.border_paint import PaintedSheet, paint_borders
 from data_synth.mesh_sequence import MeshSequence, open_sequence
 from data_synth.rig import bounding_sphere, scanner_rig

@@ -15,13 +15,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Float64
 
+from capture4d.atomic_files import write_json
 from capture4d.errors import InputError
 from capture4d.garment_extraction import painted_border
 from capture4d.mesh import boundary_loops, submesh
 from capture4d.mesh_files import MESH_SUFFIXES, read_mesh, write_mesh
 from capture4d.scans import parse_colour
 from capture4d.types import Garment, GarmentScan, Mesh
-from capture4d.workdir import write_json
 from registration.alignment import Similarity, align
 from registration.config import MeshRegistrationConfig
 from registration.quality import FrameQuality, assess

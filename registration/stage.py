@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+from capture4d.atomic_files import read_json, write_bytes, write_json, write_npz
 from capture4d.body_stage import load_tracking, tracking_digest
 from capture4d.errors import InputError
 from capture4d.garment_binding import with_body_shape
@@ -34,16 +35,8 @@ from capture4d.scans import (
 )
 from capture4d.types import Body, Garment, PoseSequence
 from capture4d.work_folder import REGISTER, VERDICTS, captured_motion, stack_vertices
-from capture4d.workdir import (
-    Stage,
-    open_stage,
-    read_json,
-    require_complete,
-    run_jobs,
-    write_bytes,
-    write_json,
-    write_npz,
-)
+from capture4d.workdir import Stage, open_stage, require_complete
+from capture4d.workers import run_jobs
 from registration.config import RegistrationConfig
 from registration.sequence import FrameResult, Mover, register_run, segments
 from registration.template import TemplateAnalysis, analyse_template

@@ -18,23 +18,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
+from capture4d.atomic_files import file_digest, read_json, write_bytes, write_json, write_npy, write_npz
 from capture4d.body import ShapedBody, with_shape
 from capture4d.errors import InputError
 from capture4d.motion_files import read_motion
 from capture4d.records import load_body, load_poses, save_body, save_garment, save_poses
 from capture4d.types import Body, PoseSequence
 from capture4d.work_folder import ANIMATE, VERDICTS, stack_vertices
-from capture4d.workdir import (
-    Stage,
-    file_digest,
-    open_stage,
-    read_json,
-    run_jobs,
-    write_bytes,
-    write_json,
-    write_npy,
-    write_npz,
-)
+from capture4d.workdir import Stage, open_stage
+from capture4d.workers import run_jobs
 from retarget.animation import AnimatedFrame, Animator
 from retarget.bodies import captured_person, require_skeleton, retargeted_mean
 from retarget.config import AnimateConfig

@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from capture4d.atomic_files import file_digest, read_json, write_json, write_npy, write_npy_rows
 from capture4d.blendshape_files import load_blendshapes, save_blendshapes
 from capture4d.body import with_shape
 from capture4d.errors import InputError
@@ -29,17 +30,8 @@ from capture4d.garment_binding import with_body_shape
 from capture4d.records import load_body, load_garment, save_body
 from capture4d.types import BlendshapeModel, Body, PoseSequence
 from capture4d.work_folder import load_moving_body, load_records, load_registration
-from capture4d.workdir import (
-    Stage,
-    file_digest,
-    open_stage,
-    read_json,
-    require_complete,
-    run_jobs,
-    write_json,
-    write_npy,
-    write_npy_rows,
-)
+from capture4d.workdir import Stage, open_stage, require_complete
+from capture4d.workers import run_jobs
 from retarget.blendshapes import ShapeSpace, as_model_arrays, shape_space, worst_errors
 from retarget.config import FitConfig
 from retarget.controls import ControlLayout, garment_joints

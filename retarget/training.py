@@ -22,9 +22,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from capture4d.atomic_files import write_bytes
 from capture4d.errors import InputError
 from capture4d.tensor_files import read_tensors, write_tensors
-from capture4d.workdir import write_bytes
 from retarget.config import LstmConfig, TrainingConfig
 from retarget.controls import ControlLayout
 from retarget.linear import LinearRegressor, mean_squared_error

@@ -17,11 +17,13 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float32
 
+from capture4d.atomic_files import file_digest, write_bytes, write_npy
 from capture4d.errors import InputError
 from capture4d.records import save_garment
 from capture4d.tangents import corner_tangents
 from capture4d.work_folder import load_registration, registered_digest
-from capture4d.workdir import Stage, file_digest, open_stage, run_jobs, write_bytes, write_npy
+from capture4d.workdir import Stage, open_stage
+from capture4d.workers import run_jobs
 from wrinkles.config import MapConfig
 from wrinkles.inference import WrinkleModel, load_model
 from wrinkles.map_spaces import encode_png, encode_png8, flip_green, to_tangent

@@ -15,11 +15,13 @@ from pathlib import Path
 
 import numpy as np
 
+from capture4d.atomic_files import read_json, write_bytes, write_json
 from capture4d.garment_stage import load_garment_scan
 from capture4d.records import save_garment
 from capture4d.types import Mesh, RegisteredSequence
 from capture4d.work_folder import failed_frames, load_registration, registered_digest, work_capture
-from capture4d.workdir import Stage, open_stage, read_json, require_complete, run_jobs, write_bytes, write_json
+from capture4d.workdir import Stage, open_stage, require_complete
+from capture4d.workers import run_jobs
 from wrinkles.config import PairConfig
 from wrinkles.map_spaces import encode_png
 from wrinkles.normal_maps import FramePair, MapTemplate, frame_pairs

@@ -20,9 +20,11 @@ import safetensors.torch
 import torch
 from safetensors import SafetensorError
 
+from capture4d.atomic_files import write_bytes, write_json
 from capture4d.errors import InputError
 from capture4d.uv_layout import millimetres_per_texel
-from capture4d.workdir import Stage, open_stage, progress, require_complete, write_bytes, write_json
+from capture4d.workdir import Stage, open_stage, require_complete
+from capture4d.workers import progress
 from wrinkles.config import PairConfig, WrinkleConfig
 from wrinkles.inference import WrinkleModel, model_bytes
 from wrinkles.map_metrics import MapScores, score

@@ -18,10 +18,12 @@ from capture4d.app.render import Drawn, render
 from capture4d.app.report import MAX_FLAGGED_ROWS, flat, is_current, joined_chart, shown, spread
 from capture4d.app.report_metrics import column
 from capture4d.app.report_pictures import CLOTH, VIEWS, Framing, Panel, data_uri
+from capture4d.atomic_files import read_json, write_bytes, write_json
 from capture4d.body import pose_frame, with_shape
 from capture4d.types import Body, PoseSequence, RegisteredSequence
 from capture4d.work_folder import ANIMATE, VERDICTS, load_moving_body, load_records, load_registration
-from capture4d.workdir import open_stage, read_json, require_complete, run_jobs, write_bytes, write_json
+from capture4d.workdir import open_stage, require_complete
+from capture4d.workers import run_jobs
 
 __all__ = ["ANIMATION_METRICS", "run"]
 

@@ -13,8 +13,8 @@ from rich.console import Console
 from rich.table import Table
 
 from capture4d.app.charts import Line, line_chart
+from capture4d.atomic_files import write_bytes
 from capture4d.rig_check import CameraCheck
-from capture4d.workdir import write_bytes
 
 __all__ = [
     "calibration_charts",

@@ -30,7 +30,7 @@ from capture4d.scan_motion import Motion
 from capture4d.scan_placement import Placement, Survey, place, place_rig, sample_surface, survey_take
 from capture4d.scan_statistics import FrameStatistics, Paints, camera_counts, measure_frame, surface_shift
 from capture4d.types import Mesh, Rig, Scan
-from capture4d.workdir import run_jobs
+from capture4d.workers import run_jobs
 
 __all__ = ["Checked", "as_json", "check_take", "exit_code", "print_table"]
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from capture4d.app.check import Checked
 from capture4d.app.check_take import TakeFolder, read_frame
+from capture4d.atomic_files import write_json
 from capture4d.errors import InputError
 from capture4d.mesh_files import MESH_SUFFIXES, read_mesh, write_mesh
 from capture4d.preflight import BadFrame
@@ -25,7 +26,7 @@ from capture4d.scan_placement import Placement, place, place_rig
 from capture4d.scan_statistics import outwardness
 from capture4d.scans import Capture, format_colour, parse_colour
 from capture4d.take_colours import template_loops
-from capture4d.workdir import run_jobs, write_json
+from capture4d.workers import run_jobs
 
 __all__ = ["fixed_path", "write_fixed"]
 

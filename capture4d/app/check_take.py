@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from capture4d.atomic_files import read_json
 from capture4d.body import ShapedBody, pose_frame, with_shape
 from capture4d.body_anny import load_anny
 from capture4d.body_tracking_jacobian import BodyState, TrackedBody, tracked_body
@@ -25,7 +26,6 @@ from capture4d.records import load_body, load_poses, load_rig
 from capture4d.scan_statistics import Paints
 from capture4d.scans import METRES, parse_colour
 from capture4d.types import PoseSequence, Rig
-from capture4d.workdir import read_json
 
 __all__ = ["Claims", "TakeFolder", "body_state", "open_take", "posed_body", "read_frame", "time_stamp", "tracked_model"]
 

@@ -100,7 +100,7 @@ def _run(arguments: list[str]) -> int:
         kept = "; finished frames are kept, the same command goes on" if error.errno == errno.ENOSPC else ""
         return _complain(f"{error.filename or 'output'}: {error.strerror}{kept}")
     except RuntimeError as error:
-        from capture4d.workdir import WorkerDied
+        from capture4d.workers import WorkerDied
 
         if not isinstance(error, WorkerDied):
             raise

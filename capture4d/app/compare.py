@@ -23,6 +23,7 @@ import torch
 from capture4d.app.compare_config import CompareConfig
 from capture4d.app.render import Drawn, heat_colours, render
 from capture4d.app.report_pictures import HEIGHT, WIDTH, Framing, Panel, colour_bar, data_uri
+from capture4d.atomic_files import file_digest, read_json, write_bytes, write_json
 from capture4d.body_stage import load_tracking
 from capture4d.errors import InputError
 from capture4d.evaluation import correspondence_errors, material_points
@@ -30,7 +31,7 @@ from capture4d.scans import Capture, read_body, read_poses, read_scan, read_trut
 from capture4d.types import Body, PoseSequence, RegisteredSequence
 from capture4d.uv_layout import millimetres_per_texel
 from capture4d.work_folder import load_registration, registered_digest, work_capture
-from capture4d.workdir import file_digest, open_stage, read_json, write_bytes, write_json
+from capture4d.workdir import open_stage
 from wrinkles.apply_stage import generated_normals
 from wrinkles.config import MapConfig, PairConfig
 from wrinkles.display import fill_holes

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from capture4d.atomic_files import read_json
 from capture4d.body_tracking_config import TrackingConfig
 from capture4d.errors import InputError
-from capture4d.workdir import read_json
 from registration.config import RegistrationConfig
 from retarget.config import AnimateConfig, FitConfig, TrainingConfig
 

@@ -22,11 +22,13 @@ from capture4d.app.charts import Line, line_chart
 from capture4d.app.report_metrics import METRICS, column, summarise, truth_measures
 from capture4d.app.report_pictures import Framing, Panel, colour_bar, draw_frame, readable_scan
 from capture4d.app.report_stages import Calibration, StagePictures, Tracking, calibration, draw_stages, tracking
+from capture4d.atomic_files import read_json, write_bytes, write_json
 from capture4d.evaluation import correspondence_errors, material_points
 from capture4d.scans import Capture, TruthModel, read_capture, read_truth_model, read_truth_vertices
 from capture4d.types import RegisteredSequence
 from capture4d.work_folder import VERDICTS, capture_path, load_records, load_registration
-from capture4d.workdir import open_stage, read_json, require_complete, run_jobs, write_bytes, write_json
+from capture4d.workdir import open_stage, require_complete
+from capture4d.workers import run_jobs
 
 __all__ = ["MAX_FLAGGED_ROWS", "ReportConfig", "flat", "is_current", "joined_chart", "run", "shown", "spread"]
 

@@ -22,6 +22,7 @@ from capture4d.app.charts import Line, line_chart
 from capture4d.app.render import Drawn, render
 from capture4d.app.report_metrics import column
 from capture4d.app.report_pictures import VIEWS, Framing, Panel, data_uri, no_scan, readable_scan
+from capture4d.atomic_files import read_json
 from capture4d.body import pose_frame, with_shape
 from capture4d.body_stage import load_tracking
 from capture4d.errors import InputError
@@ -31,7 +32,7 @@ from capture4d.records import ArrayFile, load_poses
 from capture4d.scans import Capture, read_rig
 from capture4d.take_colours import KnownColours, take_colours
 from capture4d.types import Mesh, PoseSequence, RegisteredSequence
-from capture4d.workdir import read_json, run_jobs
+from capture4d.workers import run_jobs
 
 __all__ = ["Calibration", "Section", "StagePictures", "Tracking", "calibration", "draw_stages", "tracking"]
 

@@ -27,6 +27,7 @@ import numpy as np
 import pytest
 
 from capture4d.app.cli import main
+from capture4d.atomic_files import write_bytes, write_npz
 from capture4d.body import with_shape
 from capture4d.body_anny import load_anny
 from capture4d.body_regions import body_region
@@ -36,7 +37,6 @@ from capture4d.mesh_files import write_mesh
 from capture4d.motion_retarget import SMPL_TREE
 from capture4d.records import save_body, save_poses, save_rig
 from capture4d.types import Mesh, PoseSequence
-from capture4d.workdir import write_bytes, write_npz
 from data_synth.board_views import calibration_rig, simulate_views, wave_board
 
 BOARD = "charuco:10x8:80:60:DICT_5X5_100"

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from capture4d.atomic_files import write_npz
 from capture4d.body import skin, unskin, with_pose, with_shape
 from capture4d.body_smpl import read_smpl
 from capture4d.errors import InputError
 from capture4d.motion_retarget import SMPL_TREE
 from capture4d.types import Body, Mesh
-from capture4d.workdir import write_npz
 
 
 def make_body(joints: int = 4, verts: int = 60, seed: int = 0) -> Body:

@@ -12,6 +12,7 @@ from scipy.spatial import KDTree
 
 from benchmarks.dressed_body import dress_body
 from capture4d import body_stage
+from capture4d.atomic_files import read_json
 from capture4d.body import pose_frame, with_shape
 from capture4d.body_anny import load_anny
 from capture4d.body_sequence import Followed, Quality
@@ -24,7 +25,6 @@ from capture4d.motion_retarget import pose_sequence
 from capture4d.records import save_body, save_poses
 from capture4d.scans import Capture, write_capture_description, write_scan
 from capture4d.types import Mesh, PoseSequence, Scan
-from capture4d.workdir import read_json
 
 CLOTH, SUIT = (47, 98, 201), (150, 152, 156)
 

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 from capture4d.app.cli import main
+from capture4d.atomic_files import write_bytes, write_json
 from capture4d.errors import InputError
 from capture4d.garment_stage import load_garment_scan
 from capture4d.mesh_files import read_mesh, write_mesh
 from capture4d.ply_format import ply_bytes
 from capture4d.records import load_garment, save_garment, save_poses
 from capture4d.types import Mesh, PoseSequence
-from capture4d.workdir import write_bytes, write_json
 
 
 def run(*arguments: str | Path) -> int:

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from capture4d.app.check_take import time_stamp
 from capture4d.app.cli import main
+from capture4d.atomic_files import write_json
 from capture4d.body import pose_frame, with_shape
 from capture4d.body_anny import load_anny
 from capture4d.mesh_files import read_coloured_mesh, read_mesh, write_mesh
@@ -35,7 +36,6 @@ from capture4d.scan_statistics import (
 )
 from capture4d.textures import texture_colours
 from capture4d.types import Mesh, Rig, Scan
-from capture4d.workdir import write_json
 
 BLUE, YELLOW, GREY = (47, 98, 201), (255, 196, 0), (150, 152, 156)
 PAINTS = Paints(BLUE, (YELLOW,))

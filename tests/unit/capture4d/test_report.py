@@ -9,6 +9,7 @@ import pytest
 from capture4d.app.charts import Line, line_chart, nice_ticks
 from capture4d.app.report import ReportConfig, run
 from capture4d.app.report_metrics import summarise
+from capture4d.atomic_files import write_bytes, write_json, write_npy, write_npz
 from capture4d.body_anny import load_anny
 from capture4d.errors import InputError
 from capture4d.mesh import boundary_loops
@@ -25,7 +26,7 @@ from capture4d.scans import (
     write_truth_model,
 )
 from capture4d.types import Garment, Mesh, PoseSequence, Scan
-from capture4d.workdir import open_stage, write_bytes, write_json, write_npy, write_npz
+from capture4d.workdir import open_stage
 
 FRAMES = 8
 

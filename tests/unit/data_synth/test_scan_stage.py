@@ -4,6 +4,7 @@ import shutil
 import numpy as np
 import pytest
 
+from capture4d.atomic_files import read_json
 from capture4d.errors import InputError
 from capture4d.evaluation import material_points, surface_distances
 from capture4d.mesh import boundary_loops, face_areas
@@ -18,7 +19,6 @@ from capture4d.scans import (
     read_truth_model,
 )
 from capture4d.types import Mesh
-from capture4d.workdir import read_json
 from data_synth.border_paint import paint_borders
 from data_synth.mesh_sequence import open_sequence
 from data_synth.scan_stage import _paint, run

@@ -13,9 +13,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from capture4d.atomic_files import write_bytes
 from capture4d.errors import InputError
 from capture4d.types import PoseSequence
-from capture4d.workdir import write_bytes
 from retarget.config import ControlConfig, LinearConfig, LstmConfig, TrainingConfig
 from retarget.controls import ControlLayout, control_vectors
 from retarget.linear import fit_linear, load_linear, mean_squared_error, save_linear

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from capture4d.app.cli import main
+from capture4d.atomic_files import read_json
 from capture4d.blendshape_files import load_blendshapes
 from capture4d.body import pose_frame, skin, with_shape
 from capture4d.errors import InputError
 from capture4d.records import load_body, save_body, save_garment, save_poses
 from capture4d.tensor_files import read_tensors, write_tensors
 from capture4d.work_folder import load_moving_body, load_records, load_registration
-from capture4d.workdir import read_json
 from retarget.config import SplitConfig
 from retarget.splits import split_takes
 

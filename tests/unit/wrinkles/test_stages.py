@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from capture4d.app.cli import main
+from capture4d.atomic_files import write_bytes
 from capture4d.records import load_garment, save_garment
 from capture4d.types import Garment, Mesh
-from capture4d.workdir import write_bytes
 from tests.unit.wrinkles.conftest import make_work, some_garment, some_scan, wrinkle_normals
 from wrinkles import train_stage
 from wrinkles.config import MapConfig

@@ -1,0 +1,159 @@
+"""A pool of local workers with a progress bar: one thread each, and none outlives the command."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.connection import wait
+from typing import TypeVar
+
+__all__ = ["WorkerDied", "progress", "run_jobs"]
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+
+
+class WorkerDied(RuntimeError):
+    """A worker process ended without an answer: killed, or out of memory. Finished frames are on disk."""
+
+
+def run_jobs(
+    function: Callable[[Job], Result],
+    jobs: Sequence[Job],
+    *,
+    workers: int,
+    label: str,
+    units: Callable[[Job], int] | None = None,
+    finished: Callable[[], int] | None = None,
+) -> Iterator[Result]:
+    """Run `function` on every job and yield the results as they come, with a progress bar on stderr.
+
+    Args:
+        function: importable by name, as are its jobs and results, for they travel to new processes.
+        workers: processes; 1 runs the jobs here, in order. Each worker computes on one thread, so that results do not
+            depend on how many there are.
+        units: how much of the progress a job is worth, 1 each if None.
+        finished: units done so far, read from disk once a second; for jobs that are worth many.
+    Raises:
+        WorkerDied: a worker was killed.
+    """
+    if not jobs:
+        return
+    total = sum(units(job) if units else 1 for job in jobs)
+    with progress(label, total, finished) as advance:
+        if workers <= 1 or len(jobs) <= 1:
+            for job in jobs:
+                result = function(job)
+                advance(units(job) if units else 1)
+                yield result
+            return
+        before = set(multiprocessing.active_children())
+        pool = ProcessPoolExecutor(
+            min(workers, len(jobs)), multiprocessing.get_context("spawn"), initializer=_start_worker
+        )
+        try:
+            with _worker_environment():
+                futures: dict[Future[Result], Job] = {pool.submit(function, job): job for job in jobs}
+            for future in as_completed(futures):
+                result = future.result()
+                advance(units(futures[future]) if units else 1)
+                yield result
+        except BaseException as error:
+            for worker in set(multiprocessing.active_children()) - before:
+                worker.kill()  # files are whole or absent, so there is nothing to wait for
+            if isinstance(error, BrokenProcessPool):
+                raise WorkerDied(
+                    f"{label}: a worker process was killed, perhaps for want of memory; finished frames are kept, "
+                    "the same command goes on (with fewer --workers if memory is short)"
+                ) from None
+            raise
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+@contextlib.contextmanager
+def _worker_environment() -> Iterator[None]:
+    """Processes started meanwhile leave Ctrl-C to this one, and compute on one thread.
+
+    Numerical libraries read these variables as they load; an ignored signal is inherited.
+    """
+    variables = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(dict.fromkeys(variables, "1"))
+    on_main_thread = threading.current_thread() is threading.main_thread()
+    answer = signal.signal(signal.SIGINT, signal.SIG_IGN) if on_main_thread else None
+    try:
+        yield
+    finally:
+        if on_main_thread:
+            signal.signal(signal.SIGINT, answer)
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _start_worker() -> None:
+    """End with the parent, however it ends."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def end_with_parent() -> None:
+        wait([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
+
+
+@contextlib.contextmanager
+def progress(
+    label: str, total: int, finished: Callable[[], int] | None = None, *, completed: int = 0
+) -> Iterator[Callable[[int], None]]:
+    """A progress bar with the time left, on stderr; call what it yields with the units just done.
+
+    Args:
+        finished: units done so far, read from disk once a second, instead of calls.
+        completed: units that were done before.
+    """
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description:<24}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    stop = threading.Event()
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+        task = bar.add_task(label, total=total, completed=completed)
+        before = finished() if finished else 0
+
+        def poll() -> None:
+            while finished and not stop.wait(1.0):
+                bar.update(task, completed=min(finished() - before, total))
+
+        poller = threading.Thread(target=poll, daemon=True)
+        poller.start()
+        try:
+            yield lambda count: None if finished else bar.advance(task, count)
+            bar.update(task, completed=total)
+        finally:
+            stop.set()
+            poller.join()

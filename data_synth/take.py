@@ -1,0 +1,205 @@
+"""A synthetic take before it is written: its person, motion and meshes, its simulated cloth, and what the rig sees."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from capture4d.body import PosedBody, ShapedBody, pose_frame, with_shape
+from capture4d.body_anny import load_anny
+from capture4d.motion_retarget import pose_sequence
+from capture4d.types import Mesh, PoseSequence, Rig
+from data_synth.config import FABRICS, SynthConfig
+from data_synth.motions import make_motion
+from data_synth.outfits import OUTFITS, Outfit
+from data_synth.patterns import PanelMesh, Pattern, grade, mesh_pattern, tshirt_pattern
+from data_synth.rig import bounding_sphere, scanner_rig
+from data_synth.scanner import LABEL_BODY, LABEL_GARMENT, Surface
+from data_synth.simulation import approach_poses, dress, simulate
+from data_synth.wrinkle_relaxation import WrinkleMesh, relax_frame, wrinkle_mesh
+
+__all__ = [
+    "Take",
+    "dress_colours",
+    "measured_poses",
+    "painted_band",
+    "prepare_take",
+    "simulate_take",
+    "take_rig",
+    "take_surfaces",
+]
+
+BORDER_BAND_M = 0.009
+"""Width of the painted border."""
+RIG_RADIUS_M = 0.58
+"""Smallest sphere the rig is set up for: the upper body with room for the garment."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Take:
+    """All that is known before anything is simulated."""
+
+    config: SynthConfig
+    shaped: ShapedBody
+    poses: PoseSequence
+    """The captured frames."""
+    bodies: list[PosedBody]
+    """Every simulated frame: the approach, then the clip."""
+    pattern: Pattern
+    coarse: PanelMesh
+    fine: PanelMesh
+    template: PanelMesh
+    wrinkles: WrinkleMesh
+
+    @property
+    def lead(self) -> int:
+        """Simulated frames before the clip."""
+        simulation = self.config.simulation
+        return simulation.calm_frames + simulation.approach_frames + simulation.rest_frames
+
+
+def prepare_take(config: SynthConfig) -> Take:
+    """Body, motion and meshes of a configuration. Each random part has its own stream of the one seed."""
+    streams = {
+        name: np.random.default_rng([config.seed, number])
+        for number, name in enumerate(("motion", "coarse", "fine", "template", "imperfection"))
+    }
+    if config.motion.seed:
+        streams["motion"] = np.random.default_rng([config.seed, 0, config.motion.seed])
+    shaped = _person(config.body_shape)
+    simulated = (config.frames - 1) * config.capture_every + 1
+    drafted = shaped if config.drafted_for is None else _person(config.drafted_for)
+    motion = make_motion(drafted, config.motion, config.simulation.fps, simulated, streams["motion"])
+    if config.drafted_for is not None:  # who wears the graded garment moves as who wore the first
+        motion = pose_sequence(
+            shaped, motion.rotations.astype(np.float64), motion.fps, motion.translations.astype(np.float64)
+        )
+    kept = slice(None, None, config.capture_every)
+    poses = PoseSequence(
+        motion.rotations[kept],
+        motion.translations[kept],
+        motion.shape,
+        np.arange(1, config.frames + 1, dtype=np.int32),
+        config.simulation.fps / config.capture_every,
+        motion.joint_names,
+    )
+    clip = [pose_frame(shaped, motion, index) for index in range(simulated)]
+    pattern = tshirt_pattern(shaped, config.style)
+    counts = {
+        "coarse": config.simulation.vertices,
+        "fine": config.relaxation.vertices,
+        "template": config.template_vertices,
+    }
+    first = tshirt_pattern(drafted, config.style)
+    meshes = {name: mesh_pattern(first, count, streams[name]) for name, count in counts.items()}
+    if config.drafted_for is not None:
+        meshes = {name: grade(mesh, first, pattern) for name, mesh in meshes.items()}
+    return Take(
+        config=config,
+        shaped=shaped,
+        poses=poses,
+        bodies=approach_poses(shaped, motion, config.simulation) + clip,
+        pattern=pattern,
+        coarse=meshes["coarse"],
+        fine=meshes["fine"],
+        template=meshes["template"],
+        wrinkles=wrinkle_mesh(meshes["coarse"], meshes["fine"], config.relaxation, streams["imperfection"]),
+    )
+
+
+def _person(shape: tuple[float, ...]) -> ShapedBody:
+    return with_shape(load_anny(), np.array(shape, np.float32))
+
+
+def simulate_take(take: Take) -> Iterator[tuple[int, np.ndarray, np.ndarray | None]]:
+    """Simulate a take, coarse and fine.
+
+    Yields:
+        For each simulated frame: its index (negative before the clip), the coarse cloth (C, 3), and for captured
+        frames the fine cloth (V, 3), else None.
+    """
+    fabric, lead, offsets = FABRICS[take.config.fabric], take.lead, None
+    faces = take.shaped.body.template.faces
+    start = dress(take.shaped, take.coarse, take.pattern, take.bodies[0])
+
+    def relax(coarse: np.ndarray, body: PosedBody) -> np.ndarray:
+        nonlocal offsets
+        fine, offsets = relax_frame(
+            take.wrinkles, coarse, body.vertices(), faces, offsets, fabric, take.config.relaxation
+        )
+        return fine
+
+    with ThreadPoolExecutor(1) as second_core:  # newton and numba both release the interpreter
+        waiting = []
+        for step, coarse in enumerate(simulate(take.coarse, start, take.bodies, fabric, take.config.simulation)):
+            index = step - lead
+            captured = index >= 0 and index % take.config.capture_every == 0
+            future = second_core.submit(relax, coarse, take.bodies[step]) if captured else None
+            waiting.append((index, coarse, future))
+            while waiting and (waiting[0][2] is None or waiting[0][2].done() or len(waiting) > 8):
+                index, coarse, future = waiting.pop(0)
+                yield index, coarse, None if future is None else future.result()
+        for index, coarse, future in waiting:
+            yield index, coarse, None if future is None else future.result()
+
+
+def measured_poses(take: Take) -> PoseSequence:
+    """The poses as motion capture would give them: each joint off by a slowly varying rotation."""
+    rng = np.random.default_rng([take.config.seed, 100])
+    poses = take.poses
+    noise = gaussian_filter1d(rng.standard_normal((*poses.rotations.shape[:2], 3)), 6, axis=0, mode="nearest")
+    noise *= np.radians(take.config.mocap_noise_deg) / max(noise.std(), 1e-12) / np.sqrt(3)
+    turned = Rotation.from_rotvec(noise.reshape(-1, 3)).as_matrix().reshape(poses.rotations.shape)
+    return PoseSequence(
+        (turned @ poses.rotations).astype(np.float32),
+        poses.translations,
+        poses.shape,
+        poses.frame_ids,
+        poses.fps,
+        poses.joint_names,
+    )
+
+
+def painted_band(mesh: PanelMesh) -> np.ndarray:
+    """The vertices, (V,) bool, in the painted band along every border of the pattern."""
+    border = np.concatenate(list(mesh.loops.values()))
+    corners = np.isin(mesh.faces, border)
+    return KDTree(mesh.uv[corners]).query(mesh.vertex_uv, distance_upper_bound=BORDER_BAND_M)[0] < BORDER_BAND_M
+
+
+def dress_colours(shaped: ShapedBody, outfit: Outfit) -> np.ndarray:
+    """sRGB per body vertex, (B, 3) uint8: a plain suit; head, hands and feet are bare."""
+    regions = shaped.body.regions
+    bare = np.zeros(len(shaped.vertices), bool) if regions is None else regions > 0
+    return np.where(bare[:, None], outfit.skin, outfit.suit).astype(np.uint8)
+
+
+def take_rig(config: SynthConfig, extent: np.ndarray) -> Rig:
+    """The rig around a garment whose corners, (..., 3) metres, lie within `extent` all through the clip."""
+    centre, radius = bounding_sphere(extent)
+    return scanner_rig(config.scanner, centre=centre, radius=max(radius, RIG_RADIUS_M))
+
+
+def take_surfaces(take: Take, fine: np.ndarray, surface: np.ndarray) -> list[Surface]:
+    """What the scanner sees of a frame: the painted garment, (V, 3), and the body in its suit, (B, 3); float32."""
+    fusion, (cloth, painted, dress) = take.config.scanner.fusion, _colours(take)
+    faces = take.shaped.body.template.faces
+    return [
+        Surface(Mesh(fine, take.fine.faces), cloth, LABEL_GARMENT, fusion.garment_voxel_m, painted),
+        Surface(Mesh(surface, faces), dress, LABEL_BODY, fusion.body_voxel_m),
+    ]
+
+
+@lru_cache(maxsize=1)
+def _colours(take: Take) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of the garment (V, 3), where it is painted (V,), and of the body (B, 3): the same in every frame of a take."""
+    outfit, painted = OUTFITS[take.config.outfit], painted_band(take.fine)
+    cloth = np.where(painted[:, None], outfit.border, outfit.garment).astype(np.uint8)
+    return cloth, painted, dress_colours(take.shaped, outfit)
