@@ -164,7 +164,7 @@ def _quick_clips(workers: int) -> _Clips:
 def _trained(clips: _Clips, config: WrinkleConfig, output: Path, workers: int) -> WrinkleModel:
     Console(stderr=True).print(f"{output.name}: {config.schedule.steps} steps", highlight=False)
     train_network(clips.train, output, config, pairs=clips.pairs, workers=workers)
-    return load_model(str(output / "generator.safetensors"))
+    return load_model(output / "generator.safetensors")
 
 
 def _scored(model: WrinkleModel, works: Sequence[Path]) -> _Result:

@@ -57,7 +57,7 @@ def write_tensors(path: str | Path, kind: str, tensors: Mapping[str, np.ndarray]
         note: whatever JSON holds.
     """
     text = json.dumps({"kind": kind, **note}, sort_keys=True, allow_nan=False)
-    plain = {name: np.ascontiguousarray(array) for name, array in tensors.items()}
+    plain = {name: np.asarray(array, order="C") for name, array in tensors.items()}
     write_bytes(path, safetensors.numpy.save(plain, metadata={_NOTE: text}))
 
 

@@ -61,7 +61,7 @@ def run(model: Path, work: Path, config: ApplyConfig, *, workers: int = 1, overw
         InputError: there is no registration, no usable model, or the model was trained on another template's UVs.
     """
     weights = model / "generator.safetensors" if model.is_dir() else model
-    generator, digest = load_model(str(weights)), registered_digest(work)
+    generator, digest = load_model(weights), registered_digest(work)
     config = replace(config, map=replace(config.map, size=generator.map_size))
     sequence = load_registration(work / "registration")
     template = MapTemplate.create(sequence.garment, config.map)
@@ -112,7 +112,7 @@ def _prepared(work: Path, weights: Path, config: MapConfig) -> tuple[WrinkleMode
     """One network and template per process."""
     template = MapTemplate.create(load_registration(work / "registration").garment, config)
     torch.set_num_threads(1)
-    return load_model(str(weights)), template, seam_table(template.mesh, template.raster)
+    return load_model(weights), template, seam_table(template.mesh, template.raster)
 
 
 def _make(config: ApplyConfig, job: _Chunk) -> int:

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
+from pathlib import Path
 
-import safetensors.torch
 import torch
 from jaxtyping import Float
-from safetensors import SafetensorError, safe_open
 from torch import Tensor
 from torch.nn import functional
 
 from capture4d.errors import InputError
+from capture4d.tensor_files import read_tensors, write_tensors
 from wrinkles.config import NetworkConfig
 from wrinkles.networks import UNet, set_test_statistics
 from wrinkles.training import load_weights
 
-__all__ = ["WrinkleModel", "load_model", "model_bytes"]
+__all__ = ["WrinkleModel", "load_model", "save_model"]
 
+KIND = "a wrinkle generator"
 MAP_KEYS = ("texels", "map_size", "layout_digest")
 
 
@@ -61,36 +61,30 @@ def _halved(image: Tensor, shown: Tensor) -> tuple[Tensor, Tensor]:
     return functional.normalize(mean, dim=1, eps=1e-6), (functional.avg_pool2d(shown, 2) > 0).float()
 
 
-def model_bytes(model: WrinkleModel) -> bytes:
-    """The weights as safetensors; what is needed to rebuild the network is in the metadata."""
+def save_model(path: str | Path, model: WrinkleModel) -> None:
+    """Write the weights and what is needed to rebuild the network."""
     about = {"network": asdict(model.config)} | {key: getattr(model, key) for key in MAP_KEYS}
-    weights = {name: tensor.contiguous() for name, tensor in model.generator.state_dict().items()}
-    return safetensors.torch.save(weights, {"capture4d_wrinkles": json.dumps(about)})
+    weights = {name: tensor.numpy() for name, tensor in model.generator.state_dict().items()}
+    write_tensors(path, KIND, weights, about)
 
 
-def load_model(path: str) -> WrinkleModel:
+def load_model(path: str | Path) -> WrinkleModel:
     """Read a generator.
 
     Raises:
         InputError: the file is missing, damaged, not a generator of ours, or its weights are not those of the
             architecture it claims.
     """
+    if not Path(path).is_file():
+        raise InputError(f"{path}: no such file; run: capture4d wrinkles train WORK --output MODEL")
+    file = read_tensors(path, KIND)
+    maps = {key: file.entry(key) for key in MAP_KEYS}
     try:
-        with safe_open(path, framework="pt") as file:
-            about = (file.metadata() or {}).get("capture4d_wrinkles")
-            weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; run: capture4d wrinkles train WORK --output MODEL") from None
-    except (SafetensorError, OSError) as error:
-        raise InputError(f"{path}: not a readable safetensors file, cut off or damaged ({error})") from None
-    try:
-        described = json.loads(about or "null")
-        config = NetworkConfig(**described["network"])
-        maps = {key: described[key] for key in MAP_KEYS}
-    except (TypeError, KeyError, ValueError):
-        raise InputError(f"{path}: expected a wrinkle generator, found other weights") from None
+        config = NetworkConfig(**file.entry("network"))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path}: expected the settings of a wrinkle generator, found others ({error})") from None
     with torch.device("meta"):
         generator = UNet(config)
     generator.to_empty(device="cpu")
-    load_weights(generator, weights, source=path)
+    load_weights(generator, {name: torch.from_numpy(each) for name, each in file.tensors.items()}, source=str(path))
     return WrinkleModel(generator.to(memory_format=torch.channels_last), config, **maps)  # pyright: ignore[reportCallIssue]

@@ -26,7 +26,7 @@ from capture4d.uv_layout import millimetres_per_texel
 from capture4d.workdir import Stage, open_stage, require_complete
 from capture4d.workers import progress
 from wrinkles.config import PairConfig, WrinkleConfig
-from wrinkles.inference import WrinkleModel, model_bytes
+from wrinkles.inference import WrinkleModel, save_model
 from wrinkles.map_metrics import MapScores, score
 from wrinkles.map_spaces import to_colours
 from wrinkles.pair_files import layout_digest, load_pairs, pair_template
@@ -91,7 +91,7 @@ def run(
     _resume(stage, state)
     _train(stage, state, [train for train, _ in parts], [held for _, held in parts], config)
     model = WrinkleModel(state.generator, config.network, texels=config.texels, map_size=size, layout_digest=digest)
-    write_bytes(stage.path / "generator.safetensors", model_bytes(model))
+    save_model(stage.path / "generator.safetensors", model)
     mm_per_texel = millimetres_per_texel(mesh, config.texels)
     measured = {}
     for _, held in parts:

@@ -89,7 +89,7 @@ def run(work: Path, model: Path, config: CompareConfig, *, workers: int = 1, ove
         InputError: the work folder lacks registration or scans, or the model is of another template.
     """
     weights = model / "generator.safetensors" if model.is_dir() else model
-    generator = load_model(str(weights))
+    generator = load_model(weights)
     ensure_pairs(work, PairConfig(map=MapConfig(size=generator.map_size)), workers=workers)
     upstream = {"registration": registered_digest(work), "model": file_digest([weights], root=weights.parent)}
     stage = open_stage(
