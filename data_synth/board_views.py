@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Float64, Int32
@@ -23,6 +23,8 @@ __all__ = ["calibration_rig", "measure_corner_errors", "simulate_views", "visibl
 VOLUME_M = (1.2, 1.8, 1.2)
 """Width, height and depth of the volume, about its centre."""
 CENTRE = (0.0, 1.1, 0.0)
+WITHIN_M = 0.4
+"""The middle of a board stays half of this within the volume."""
 STEEPEST_COSINE = 0.35
 """A board seen at less than this, 70 degrees from its normal, is not detected."""
 SMALLEST_VIEW = 12
@@ -66,9 +68,16 @@ def calibration_rig(
 
 
 def wave_board(
-    board: Board, count: int, *, rng: np.random.Generator, arc_deg: float = 360.0
+    board: Board,
+    count: int,
+    *,
+    rng: np.random.Generator,
+    arc_deg: float = 360.0,
+    centre: Sequence[float] | np.ndarray = CENTRE,
+    volume_m: tuple[float, float, float] = VOLUME_M,
 ) -> Float64[np.ndarray, "poses 4 4"]:
     """T_world_board of a board held anywhere in the volume, facing anywhere in the arc, or up, or a little down."""
+    room = np.maximum(np.array(volume_m) - WITHIN_M, 0.0)
     poses = np.tile(np.eye(4), (count, 1, 1))
     for pose in poses:
         azimuth, rise = np.radians(rng.uniform(0, arc_deg)), np.radians(rng.uniform(-35, 50))
@@ -77,7 +86,7 @@ def wave_board(
         x /= np.linalg.norm(x)
         upright = np.stack([x, np.cross(away, x), away], axis=1)
         pose[:3, :3] = upright @ rotation_from_vector(np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi)]))
-        middle = CENTRE + rng.uniform(-0.5, 0.5, 3) * (np.array(VOLUME_M) - 0.4)
+        middle = centre + rng.uniform(-0.5, 0.5, 3) * room
         pose[:3, 3] = middle - pose[:3, :3] @ board.middle
     return poses
 

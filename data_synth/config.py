@@ -303,3 +303,13 @@ TRAINING_SETS: dict[str, TrainingSetConfig] = {
 }
 """Sets of takes by name. `tshirt-train` has 1,800 frames with scans and 1,200 without, which by the costs that
 `python -m benchmarks synthesis` prints is about 14,000 CPU seconds; `tiny-train` is its small likeness."""
+
+
+@dataclass(frozen=True, slots=True)
+class BoardConfig:
+    """A board and how it is waved about."""
+
+    board: str = "charuco:8x6:100:74:DICT_4X4_50"
+    """charuco:COLUMNSxROWS:SQUARE_MM:MARKER_MM:DICTIONARY."""
+    poses: int = 24
+    seed: int = 0

@@ -20,7 +20,7 @@ from capture4d.app.capture_commands import Calibrate, Check, CheckRig
 from capture4d.app.file_commands import ConvertBody, ConvertPoses, ConvertRig, RegisterMesh, Template
 from capture4d.app.model_commands import Animate, Fit
 from capture4d.app.stage_commands import Extract, Register, Report, Run, Track
-from capture4d.app.synthesis_commands import Demo, Scan, Synth
+from capture4d.app.synthesis_commands import Demo, Scan, Synth, SynthBoard
 from capture4d.app.wrinkle_commands import Compare, WrinklesApply, WrinklesMaps, WrinklesTrain
 from capture4d.errors import InputError
 from data_synth import config as synth_config
@@ -46,6 +46,7 @@ _COMMANDS: Mapping[str, Any] = {
     "demo": Demo,
     "synth": Synth,
     "scan": Scan,
+    "synth-board": SynthBoard,
     "check": Check,
     "template": Template,
     "extract": Extract,

@@ -14,19 +14,22 @@ from retarget.config import AnimateConfig, FitConfig, TrainingConfig
 __all__ = ["broken_limits", "needs_tracking", "parse_limits", "run_all", "run_demo", "run_report", "run_stages"]
 
 
+BOARD_POSES = 16
+"""Of the board that the demo calibrates with."""
 OTHER_PERSON = (1.5, 2.0)
 """Whom the demo puts the garment on: taller and heavier than the captured subject."""
 
 
 def run_demo(output: Path, *, workers: int, overwrite: bool = False) -> tuple[Path, Path]:
-    """Synthesise `output`/capture, run everything on it, its poses left aside, learn the garment and put it on another
-    body; the paths of the two reports."""
+    """Synthesise `output`/capture, calibrate its rig from photographs of a board, run everything on the scans, the true
+    poses left aside, learn the garment and put it on another body; the paths of the two reports."""
     from data_synth.config import PRESETS
     from data_synth.stage import run as synthesise
     from retarget.animate_stage import run as animate
     from retarget.stage import run as fit
 
     synthesise(output / "capture", PRESETS["demo"], workers=workers, overwrite=overwrite)
+    _calibrate_demo(output / "capture" / "rig.json", output / "rig", workers=workers, overwrite=overwrite)
     report = run_all(output / "capture", output, RegistrationConfig(), track=True, workers=workers, overwrite=overwrite)
     quick = TrainingConfig(epochs=60, patience=20)
     fit([output], output / "retarget", FitConfig(training=quick), workers=workers, overwrite=overwrite)
@@ -40,6 +43,20 @@ def run_demo(output: Path, *, workers: int, overwrite: bool = False) -> tuple[Pa
         overwrite=overwrite,
     )
     return report, run_report(output / "other", workers=workers, overwrite=overwrite)
+
+
+def _calibrate_demo(truth: Path, folder: Path, *, workers: int, overwrite: bool) -> None:
+    """Photograph a board with the true rig, and calibrate from the photographs alone."""
+    from capture4d.app.calibration_page import write_page
+    from capture4d.calibration_stage import run as calibrate
+    from data_synth.board_stage import run as photograph
+    from data_synth.config import BoardConfig
+
+    config = BoardConfig(poses=BOARD_POSES)
+    photograph(truth, folder / "board", config, workers=workers, overwrite=overwrite)
+    if overwrite or not (folder / "calibration.html").is_file():
+        report = calibrate(folder / "board", folder / "rig.json", config.board, workers=workers)
+        write_page(folder / "calibration.html", report)
 
 
 def run_all(

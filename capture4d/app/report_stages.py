@@ -65,8 +65,8 @@ class Calibration:
 
 
 def calibration(capture: Capture, work: Path) -> Calibration | None:
-    """The rig of the capture, with the calibration.json beside it or in the work folder."""
-    found = [path for folder in (capture.path, work) if (path := folder / "calibration.json").is_file()]
+    """The rig of the capture, with the calibration.json beside it, in the work folder or in its rig/."""
+    found = [path for folder in (capture.path, work, work / "rig") if (path := folder / "calibration.json").is_file()]
     if found:
         report = read_json(found[0])
         counts = f"{len(report['cameras'])} cameras, {len(report['poses'])} poses, {report['corners']:,} corners"

@@ -1,4 +1,4 @@
-"""`capture4d demo`, `synth` and `scan`: captures that nobody filmed."""
+"""`capture4d demo`, `synth`, `scan` and `synth-board`: captures that nobody filmed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from capture4d.errors import InputError
 from data_synth import config as synth_config
 from data_synth.scanner_config import ScanConfig
 
-__all__ = ["Demo", "Scan", "Synth"]
+__all__ = ["Demo", "Scan", "Synth", "SynthBoard"]
 
 
 def _with_sensor(config: Any, sensor: Literal["depth", "stereo"] | None) -> Any:
@@ -26,7 +26,7 @@ def _with_sensor(config: Any, sensor: Literal["depth", "stereo"] | None) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class Demo(StageOptions):
-    """Make a synthetic capture, register it, learn the garment, put it on another body: all in minutes."""
+    """Make a synthetic capture, calibrate, track, register, learn the garment, put it on another body: in minutes."""
 
     output: Path = Path("out")
     """Folder for everything, the capture included."""
@@ -98,4 +98,22 @@ class Scan(StageOptions):
             overwrite=self.overwrite,
         )
         print(f"capture: {self.output}")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class SynthBoard(StageOptions):
+    """Photograph a calibration board with a virtual rig: images to try `calibrate` and `check-rig` on."""
+
+    rig: Annotated[Positional[Path], arg(metavar="RIG")]
+    """rig.json, such as that of a synthetic capture."""
+    images: Annotated[Positional[Path], arg(metavar="IMAGES")]
+    """Folder to write, IMAGES/CAMERA/POSE.png."""
+    config: Annotated[synth_config.BoardConfig, arg(name="")] = field(default_factory=synth_config.BoardConfig)
+
+    def __call__(self) -> int:
+        from data_synth.board_stage import run
+
+        run(self.rig, self.images, self.config, workers=self.workers, overwrite=self.overwrite)
+        print(f"board images: {self.images}")
         return 0
