@@ -7,14 +7,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from capture4d.atomic_files import file_digest, write_bytes
-from capture4d.calibration_board import parse_board
+from capture4d.calibration_board import Board, parse_board
 from capture4d.errors import InputError
 from capture4d.records import load_rig
 from capture4d.types import Rig
-from capture4d.workdir import Stage, open_stage
+from capture4d.workdir import open_stage
 from capture4d.workers import run_jobs
 from data_synth.board_images import photograph_board
 from data_synth.board_views import visible_corners, wave_board
@@ -25,12 +25,23 @@ __all__ = ["run", "shared_volume"]
 SCHEMA = 1
 
 
-@dataclass(frozen=True, slots=True)
+CANDIDATES = 3
+"""Poses drawn for each that is taken."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _Job:
-    stage: Stage
-    rig: Path
+    """One pose, and the cameras that see it."""
+
+    images: Path
+    rig: Rig
     config: BoardConfig
     pose: int
+    T_world_board: np.ndarray
+    cameras: tuple[int, ...]
+
+    def path(self, camera: int) -> Path:
+        return self.images / self.rig.names[camera] / f"{self.pose + 1:03d}.png"
 
 
 def run(rig_path: Path, images: Path, config: BoardConfig, *, workers: int = 1, overwrite: bool = False) -> str:
@@ -41,21 +52,20 @@ def run(rig_path: Path, images: Path, config: BoardConfig, *, workers: int = 1, 
     Raises:
         InputError: the board or the rig cannot be read, or the folder holds something else.
     """
-    parse_board(config.board)
-    rig = load_rig(rig_path)
+    board, rig = parse_board(config.board), load_rig(rig_path)
     if config.poses < 1:
         raise InputError(f"--poses: expected at least 1, found {config.poses}")
     upstream = {"rig": file_digest([rig_path], root=rig_path.parent)}
     stage = open_stage(images, name="synth-board", schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite)
-    wanted = [
-        _image(images, rig.names[camera], pose) for pose in range(config.poses) for camera in _seeing(rig, config, pose)
+    poses, seen = _shoot(rig, board, config)
+    jobs = [
+        _Job(images, rig, config, pose, T_world_board, tuple(np.flatnonzero(seen[pose]).tolist()))
+        for pose, T_world_board in enumerate(poses)
     ]
-    if stage.was_complete and all(path.is_file() for path in wanted):
-        return stage.finish(wanted, changed=False)
-    jobs = [_Job(stage, rig_path, config, pose) for pose in range(config.poses)]
-    for _ in run_jobs(_photograph, jobs, workers=workers, label="Photographing"):
+    lost = [job for job in jobs if not all(job.path(camera).is_file() for camera in job.cameras)]
+    for _ in run_jobs(_photograph, lost, workers=workers, label="Photographing"):
         pass
-    return stage.finish(wanted)
+    return stage.finish((job.path(camera) for job in jobs for camera in job.cameras), changed=bool(lost))
 
 
 def shared_volume(rig: Rig) -> tuple[Float64[np.ndarray, " 3"], float]:
@@ -68,31 +78,36 @@ def shared_volume(rig: Rig) -> tuple[Float64[np.ndarray, " 3"], float]:
     return centre, float((np.linalg.norm(rig.centres - centre, axis=1) * sine).min())
 
 
-def _poses(rig: Rig, config: BoardConfig) -> np.ndarray:
+def _shoot(
+    rig: Rig, board: Board, config: BoardConfig
+) -> tuple[Float64[np.ndarray, "poses 4 4"], Bool[np.ndarray, "poses cameras"]]:
+    """T_world_board of every pose and who sees it, by an operator who looks after the cameras that saw least so far."""
     centre, radius = shared_volume(rig)
     side = 2 * radius / np.sqrt(3)
-    board = parse_board(config.board)
-    return wave_board(
-        board, config.poses, rng=np.random.default_rng([config.seed, 0]), centre=centre, volume_m=(side, side, side)
+    drawn = wave_board(
+        board,
+        CANDIDATES * config.poses,
+        rng=np.random.default_rng([config.seed, 0]),
+        centre=centre,
+        volume_m=(side, side, side),
     )
-
-
-def _seeing(rig: Rig, config: BoardConfig, pose: int) -> list[int]:
-    board, T_world_board = parse_board(config.board), _poses(rig, config)[pose]
-    return [camera for camera in range(len(rig.names)) if len(visible_corners(rig, camera, board, T_world_board)[0])]
-
-
-def _image(images: Path, camera: str, pose: int) -> Path:
-    return images / camera / f"{pose + 1:03d}.png"
+    seen = np.array(
+        [[len(visible_corners(rig, camera, board, pose)[0]) > 0 for camera in range(len(rig.names))] for pose in drawn]
+    )
+    taken: list[int] = []
+    for _ in range(config.poses):
+        worth = (seen / (1.0 + seen[taken].sum(axis=0)) ** 2).sum(axis=1)
+        worth[taken] = -1.0
+        taken.append(int(worth.argmax()))
+    return drawn[taken], seen[taken]
 
 
 def _photograph(job: _Job) -> None:
-    rig, board = load_rig(job.rig), parse_board(job.config.board)
-    for camera in _seeing(rig, job.config, job.pose):
-        path = _image(job.stage.path, rig.names[camera], job.pose)
-        if path.is_file():
+    board = parse_board(job.config.board)
+    for camera in job.cameras:
+        if job.path(camera).is_file():
             continue
         rng = np.random.default_rng([job.config.seed, 1, job.pose, camera])
-        image = photograph_board(rig, camera, board, _poses(rig, job.config)[job.pose], rng=rng)
+        image = photograph_board(job.rig, camera, board, job.T_world_board, rng=rng)
         encoded = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
-        write_bytes(path, encoded.tobytes())
+        write_bytes(job.path(camera), encoded.tobytes())
