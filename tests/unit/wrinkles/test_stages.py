@@ -196,7 +196,7 @@ def test_a_checkpoint_of_another_architecture(
     damaged = (trained / "generator.safetensors").read_bytes()[:-100]
     (trained / "generator.safetensors").write_bytes(damaged)
     assert "generator.safetensors: not a readable safetensors" in fails(capsys, "wrinkles", "apply", trained, work)
-    assert "other weights" in fails(capsys, "wrinkles", "apply", other / last, work)
+    assert "expected a wrinkle generator" in fails(capsys, "wrinkles", "apply", other / last, work)
     assert "no such file" in fails(capsys, "wrinkles", "apply", tmp_path / "nowhere", work)
 
 
