@@ -73,6 +73,8 @@ class DataConfig:
     """Reject a match whose normals differ by more than this angle's cosine."""
     robust_scale: float = 0.4
     """Scale of the Geman-McClure weight, as a share of the distance gate."""
+    cold_robust_scale: float = 0.8
+    """The same under a cold schedule, whose start is farther off: less is given up as an outlier."""
     point_share: float = 0.0
     """Weight of the tangential part of the match: 0 is point-to-plane, 1 is point-to-point."""
     smoothing_passes: int = 1
@@ -159,9 +161,10 @@ class SequenceConfig:
     keyframe_bend_deg: float = 8.0
     """A keyframe's joints are at most this far from the rest pose, root mean square, degrees; 0 makes one segment."""
     start: Literal["best", "previous", "skinned"] = "best"
-    """Start of a frame: the frame before, the skinned pose, or whichever is nearer to the scan."""
-    carry: float = 0.7
-    """Share of the offsets from the skinned pose that a frame hands to the next, in the rest pose."""
+    """Start of a frame: the frame before, as it lies and moved with the body; the skinned pose; or a blend of them by
+    how near each is to the scan."""
+    relax: float = 0.4
+    """Trust in the skinned pose within the blend, beside 1 in the frame before: pulls cloth back that has drifted."""
     cold_above: float = 0.004
     """Take the cold schedule when the median distance from start to scan exceeds this, metres."""
 
@@ -213,7 +216,7 @@ PAPER = RegistrationConfig(
     boundary=BoundaryConfig(coarse_rule="argmax", dense_rule="argmax", along_curve=False),
     coarse=CoarseConfig(cold=PAPER_SCHEDULE, warm=PAPER_SCHEDULE),
     dense=DenseConfig(cold=NO_STEPS, warm=NO_STEPS),
-    sequence=SequenceConfig(start="skinned", carry=0.0),
+    sequence=SequenceConfig(start="skinned", relax=0.0),
 )
 
 """DeepWrinkles as printed: constant weights, no dense stage."""
@@ -227,6 +230,7 @@ SOFT = RegistrationConfig(
         point_share=1.0,
         smoothing_passes=0,
         robust_scale=1.0,
+        cold_robust_scale=1.0,
         min_normal_cosine=0.2,
         normal_length=0.06,
     ),

@@ -39,7 +39,7 @@ from registration.template import TemplateAnalysis, UnknownBorderError
 __all__ = ["FrameResult", "Mover", "register_run", "segments"]
 
 
-BLEND_FLOOR, BLEND_REACH = 0.001, 0.1
+BLEND_FLOOR, BLEND_REACH = 0.002, 0.1
 """Metres: below the floor two predictions fit equally well; beyond the reach one is as bad as another."""
 
 
@@ -96,15 +96,15 @@ class Mover:
         return np.sqrt((share * angle**2).sum(axis=1) / max(float(share.sum()), 1e-12))
 
     def carried(
-        self, vertices: Float32[np.ndarray, "verts 3"], before: int, index: int, share: float
+        self, vertices: Float32[np.ndarray, "verts 3"], before: int, index: int
     ) -> Float64[np.ndarray, "verts 3"]:
-        """Vertices of frame `before` in the pose of frame `index`, offsets from the skinned template times `share`."""
+        """Vertices of frame `before` in the pose of frame `index`, with their offsets from the skinned template."""
         rest, flagged = unskin(
             vertices.astype(np.float64), self.skin_weights, pose_frame(self.shaped, self.poses, before).transforms
         )
         offset = np.where(flagged[:, None], 0.0, rest - self.rest)
         transforms = pose_frame(self.shaped, self.poses, index).transforms
-        return skin(self.rest + share * offset, self.skin_weights, transforms)
+        return skin(self.rest + offset, self.skin_weights, transforms)
 
 
 def segments(mover: Mover | None, frames: int, config: SequenceConfig) -> list[range]:
@@ -207,8 +207,8 @@ def _predictions(
     start = config.sequence.start
     if before is not None and start != "skinned":
         vertices, at = before
-        if mover is not None and config.sequence.carry > 0.0:
-            found["carried"] = mover.carried(vertices, at, index, config.sequence.carry)
+        if mover is not None:
+            found["carried"] = mover.carried(vertices, at, index)
         found["previous"] = vertices.astype(np.float64)
     if mover is not None and (start != "previous" or not found):
         found["skinned"] = mover.skinned(index)
@@ -226,10 +226,12 @@ def _choose(
     subset = analysis.coarse_vertices
     misfits = {name: _distances(scan, vertices[subset]) for name, vertices in candidates.items()}
     if "carried" in candidates and "previous" in candidates:
-        share = _share_of_carried(analysis, misfits["carried"], misfits["previous"])[:, None]
-        blended = share * candidates["carried"] + (1.0 - share) * candidates["previous"]
+        trust = {"carried": 1.0, "previous": 1.0, "skinned": config.sequence.relax}
+        blend = [name for name in trust if name in candidates]
+        shares = _shares(analysis, [misfits[name] for name in blend], [trust[name] for name in blend])
+        blended = sum(share[:, None] * candidates[name] for name, share in zip(blend, shares, strict=True))
         others = {name: vertices for name, vertices in candidates.items() if name not in ("carried", "previous")}
-        candidates = {**others, "blended": blended}
+        candidates = {**others, "blended": np.asarray(blended)}
         misfits["blended"] = _distances(scan, candidates["blended"][subset])
     median = {name: float(np.median(misfits[name])) for name in candidates}
     name = min(median, key=lambda key: median[key])
@@ -242,18 +244,26 @@ def _distances(scan: FrameScan, points: np.ndarray) -> np.ndarray:
     return np.minimum(scan.surface.grid.query(points, BLEND_REACH)[0], BLEND_REACH)
 
 
-def _share_of_carried(analysis: TemplateAnalysis, carried: np.ndarray, previous: np.ndarray) -> np.ndarray:
-    """Weight (V,) of the carried prediction against the previous frame, smooth over the template.
+def _shares(
+    analysis: TemplateAnalysis, misfits: Sequence[np.ndarray], trust: Sequence[float]
+) -> Float64[np.ndarray, "predictions verts"]:
+    """Shares of predictions in their blend, smooth over the template: `trust` over the square of the misfit.
 
     Sleeves follow the arms, a hem lags behind a twist and slides: where a prediction is off, its distance to the scan
-    tells. The distances are averaged at the nodes of the deformation graph and spread to their vertices.
+    tells. The skinned pose knows nothing of how the cloth has slid, but does not drift either: where it fits nearly as
+    well as the frame before, cloth whose sliding no fold betrays returns to it within tens of frames. The distances are
+    averaged at the nodes of the deformation graph and spread to their vertices.
     """
     nodes, weights = analysis.graph.vertex_nodes, analysis.graph.vertex_weights
-    subset = analysis.coarse_vertices
-    squares = []
-    for misfit in (carried, previous):
-        spread = weights[subset] * (misfit[:, None] ** 2 + BLEND_FLOOR**2)
-        total = np.bincount(nodes[subset].reshape(-1), spread.reshape(-1), minlength=len(analysis.graph.nodes))
-        squares.append(total)
-    share = squares[1] / np.maximum(squares[0] + squares[1], 1e-30)
-    return np.einsum("vk,vk->v", weights, share[nodes])
+    subset, count = analysis.coarse_vertices, len(analysis.graph.nodes)
+    near, given = nodes[subset].reshape(-1), weights[subset]
+    total = np.maximum(np.bincount(near, given.reshape(-1), minlength=count), 1e-12)
+    worth = np.stack(
+        [
+            share
+            / (np.bincount(near, (given * misfit[:, None] ** 2).reshape(-1), minlength=count) / total + BLEND_FLOOR**2)
+            for misfit, share in zip(misfits, trust, strict=True)
+        ]
+    )
+    shares = worth / worth.sum(axis=0)
+    return np.einsum("vk,pvk->pv", weights, shares[:, nodes])

@@ -43,7 +43,7 @@ from registration.template import TemplateAnalysis, analyse_template
 
 __all__ = ["run"]
 
-SCHEMA = 2
+SCHEMA = 3
 
 
 @dataclass(frozen=True, slots=True)
