@@ -73,8 +73,6 @@ class DataConfig:
     """Reject a match whose normals differ by more than this angle's cosine."""
     robust_scale: float = 0.4
     """Scale of the Geman-McClure weight, as a share of the distance gate."""
-    cold_robust_scale: float = 0.8
-    """The same under a cold schedule, whose start is farther off: less is given up as an outlier."""
     point_share: float = 0.0
     """Weight of the tangential part of the match: 0 is point-to-plane, 1 is point-to-point."""
     smoothing_passes: int = 1
@@ -138,7 +136,7 @@ class CoarseConfig:
 class DenseConfig:
     """The per-vertex stage."""
 
-    cold: Schedule = Schedule(10, (0.03, 0.012), smooth=(0.05, 0.02), stretch=(10.0, 0.05), boundary=(0.3, 0.1))
+    cold: Schedule = Schedule(12, (0.03, 0.012), smooth=(0.05, 0.02), stretch=(10.0, 0.03), boundary=(0.3, 0.05))
     """After a cold coarse stage."""
     warm: Schedule = Schedule(3, (0.02, 0.012), smooth=(0.06, 0.05), stretch=(10.0, 0.05), boundary=(0.2, 0.1))
     """After a warm coarse stage."""
@@ -163,7 +161,7 @@ class SequenceConfig:
     start: Literal["best", "previous", "skinned"] = "best"
     """Start of a frame: the frame before, as it lies and moved with the body; the skinned pose; or a blend of them by
     how near each is to the scan."""
-    relax: float = 0.4
+    relax: float = 0.5
     """Trust in the skinned pose within the blend, beside 1 in the frame before: pulls cloth back that has drifted."""
     cold_above: float = 0.004
     """Take the cold schedule when the median distance from start to scan exceeds this, metres."""
@@ -230,7 +228,6 @@ SOFT = RegistrationConfig(
         point_share=1.0,
         smoothing_passes=0,
         robust_scale=1.0,
-        cold_robust_scale=1.0,
         min_normal_cosine=0.2,
         normal_length=0.06,
     ),

@@ -133,9 +133,7 @@ def _coarse_stage(
     for step in range(schedule.steps):
         at = (step, schedule.steps)
         normals = mesh_normals(vertices, analysis.faces)[subset]
-        terms = [
-            _data_term(data_rows, scan.surface, vertices[subset], normals, anneal(schedule.gate, *at), config, near)
-        ]
+        terms = [_data_term(data_rows, scan.surface, vertices[subset], normals, anneal(schedule.gate, *at), config)]
         if step == 0 and not terms[0].metric.any():
             raise InputError(
                 f"frame {scan.frame_id}: expected scan vertices within {schedule.gate[0]:g} m of the start, found none"
@@ -191,7 +189,7 @@ def _dense_stage(
         at = (step, schedule.steps)
         normals = mesh_normals(vertices, analysis.faces)
         gate = anneal(schedule.gate, *at)
-        terms = [_data_term(analysis.vertex_rows, scan.surface, vertices, normals, gate, config, near)]
+        terms = [_data_term(analysis.vertex_rows, scan.surface, vertices, normals, gate, config)]
         terms += _border_terms(
             analysis, border_rows, scan, vertices, config.boundary.dense_rule, config.boundary.along_curve,
             anneal(schedule.boundary, *at), config,
@@ -218,26 +216,19 @@ def _dense_stage(
 
 
 def _data_term(
-    rows: Rows,
-    surface: ScanSurface,
-    points: np.ndarray,
-    normals: np.ndarray,
-    gate: float,
-    config: RegistrationConfig,
-    near: bool,
+    rows: Rows, surface: ScanSurface, points: np.ndarray, normals: np.ndarray, gate: float, config: RegistrationConfig
 ) -> RowTerm:
     data = config.data
-    robust_scale = data.robust_scale if near else data.cold_robust_scale
     if data.rule == "both_ways":
         found = match_both_ways(
             surface, points, normals, gate=gate, min_normal_cosine=data.min_normal_cosine,
-            robust_scale=robust_scale, neighbours=3, max_points=data.max_voters,
+            robust_scale=data.robust_scale, neighbours=3, max_points=data.max_voters,
             normal_length=data.normal_length,
         )  # fmt: skip
     else:
         found = match(
             surface, points, normals,
-            gate=gate, min_normal_cosine=data.min_normal_cosine, robust_scale=robust_scale,
+            gate=gate, min_normal_cosine=data.min_normal_cosine, robust_scale=data.robust_scale,
         )  # fmt: skip
     metric = plane_metric(found.normals, found.weights / len(points), data.point_share)
     return RowTerm(rows, metric, points - found.points)

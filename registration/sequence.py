@@ -226,13 +226,10 @@ def _choose(
     subset = analysis.coarse_vertices
     misfits = {name: _distances(scan, vertices[subset]) for name, vertices in candidates.items()}
     if "carried" in candidates and "previous" in candidates:
-        trust = {"carried": 1.0, "previous": 1.0, "skinned": config.sequence.relax}
-        blend = [name for name in trust if name in candidates]
-        shares = _shares(analysis, [misfits[name] for name in blend], [trust[name] for name in blend])
-        blended = sum(share[:, None] * candidates[name] for name, share in zip(blend, shares, strict=True))
+        blended = _blend(analysis, candidates, misfits, config.sequence.relax)
         others = {name: vertices for name, vertices in candidates.items() if name not in ("carried", "previous")}
-        candidates = {**others, "blended": np.asarray(blended)}
-        misfits["blended"] = _distances(scan, candidates["blended"][subset])
+        candidates = {**others, "blended": blended}
+        misfits["blended"] = _distances(scan, blended[subset])
     median = {name: float(np.median(misfits[name])) for name in candidates}
     name = min(median, key=lambda key: median[key])
     near = max(config.sequence.cold_above, COLD_SPACINGS * scan.surface.spacing)
@@ -244,26 +241,27 @@ def _distances(scan: FrameScan, points: np.ndarray) -> np.ndarray:
     return np.minimum(scan.surface.grid.query(points, BLEND_REACH)[0], BLEND_REACH)
 
 
-def _shares(
-    analysis: TemplateAnalysis, misfits: Sequence[np.ndarray], trust: Sequence[float]
-) -> Float64[np.ndarray, "predictions verts"]:
-    """Shares of predictions in their blend, smooth over the template: `trust` over the square of the misfit.
+def _blend(
+    analysis: TemplateAnalysis, candidates: Mapping[str, np.ndarray], misfits: Mapping[str, np.ndarray], relax: float
+) -> Float64[np.ndarray, "verts 3"]:
+    """The frame before, carried and as it lay, and a little of the skinned pose; smooth over the template.
 
     Sleeves follow the arms, a hem lags behind a twist and slides: where a prediction is off, its distance to the scan
-    tells. The skinned pose knows nothing of how the cloth has slid, but does not drift either: where it fits nearly as
-    well as the frame before, cloth whose sliding no fold betrays returns to it within tens of frames. The distances are
+    tells. The skinned pose knows nothing of how the cloth has slid, but it does not drift either: where it fits as well,
+    cloth whose sliding no fold betrays returns to it within tens of frames. Shares are trust over squared misfit,
     averaged at the nodes of the deformation graph and spread to their vertices.
     """
     nodes, weights = analysis.graph.vertex_nodes, analysis.graph.vertex_weights
     subset, count = analysis.coarse_vertices, len(analysis.graph.nodes)
     near, given = nodes[subset].reshape(-1), weights[subset]
     total = np.maximum(np.bincount(near, given.reshape(-1), minlength=count), 1e-12)
-    worth = np.stack(
-        [
-            share
-            / (np.bincount(near, (given * misfit[:, None] ** 2).reshape(-1), minlength=count) / total + BLEND_FLOOR**2)
-            for misfit, share in zip(misfits, trust, strict=True)
-        ]
-    )
-    shares = worth / worth.sum(axis=0)
-    return np.einsum("vk,pvk->pv", weights, shares[:, nodes])
+
+    def worth(name: str, trust: float) -> np.ndarray:
+        spread = np.bincount(near, (given * misfits[name][:, None] ** 2).reshape(-1), minlength=count)
+        return trust / (spread / total + BLEND_FLOOR**2)
+
+    trusts = {"carried": 1.0, "previous": 1.0, "skinned": relax}
+    names = [name for name in trusts if name in candidates]
+    worths = np.stack([worth(name, trusts[name]) for name in names])
+    shares = np.einsum("vk,pvk->pv", weights, (worths / worths.sum(axis=0))[:, nodes])
+    return np.einsum("pv,pvc->vc", shares, np.stack([candidates[name] for name in names]))
