@@ -161,7 +161,7 @@ class SequenceConfig:
     start: Literal["best", "previous", "skinned"] = "best"
     """Start of a frame: the frame before, as it lies and moved with the body; the skinned pose; or a blend of them by
     how near each is to the scan."""
-    relax: float = 0.5
+    relax: float = 0.4
     """Trust in the skinned pose within the blend, beside 1 in the frame before: pulls cloth back that has drifted."""
     cold_above: float = 0.004
     """Take the cold schedule when the median distance from start to scan exceeds this, metres."""

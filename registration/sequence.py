@@ -247,8 +247,8 @@ def _blend(
     """The frame before, carried and as it lay, and a little of the skinned pose; smooth over the template.
 
     Sleeves follow the arms, a hem lags behind a twist and slides: where a prediction is off, its distance to the scan
-    tells. The skinned pose knows nothing of how the cloth has slid, but it does not drift either: where it fits as well,
-    cloth whose sliding no fold betrays returns to it within tens of frames. Shares are trust over squared misfit,
+    tells. The skinned pose knows nothing of how the cloth has slid, but it does not drift either: where it fits as
+    well, cloth whose sliding no fold betrays returns to it within tens of frames. Shares are trust over squared misfit,
     averaged at the nodes of the deformation graph and spread to their vertices.
     """
     nodes, weights = analysis.graph.vertex_nodes, analysis.graph.vertex_weights
