@@ -71,7 +71,8 @@ def calibration(capture: Capture, work: Path) -> Calibration | None:
         report = read_json(found[0])
         counts = f"{len(report['cameras'])} cameras, {len(report['poses'])} poses, {report['corners']:,} corners"
         section = Section(calibration_tiles(report), calibration_charts(report))
-        return Calibration(section, f"{counts}; {report['board']}. Everything is in calibration.html.")
+        page = found[0].with_name("calibration.html")
+        return Calibration(section, f"{counts}; {report['board']}. Everything is in {page}.")
     rig = read_rig(capture)
     if rig is None:
         return None
