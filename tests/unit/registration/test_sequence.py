@@ -11,7 +11,7 @@ from capture4d.errors import InputError
 from capture4d.types import Body, Garment, Mesh, PoseSequence
 from registration.config import SequenceConfig
 from registration.register import prepare_frame
-from registration.sequence import Mover, _choose, _predictions, register_run, segments
+from registration.sequence import Mover, _blend, _choose, _distances, _predictions, register_run, segments
 from registration.template import analyse_template
 
 FRAMES = 6
@@ -192,3 +192,25 @@ def test_where_the_hem_lags_the_blend_is_nearer_than_both_its_parts(bound, body,
     truth = place(analysis.rest)
     error = {key: np.linalg.norm(vertices - truth, axis=1).mean() for key, vertices in {**parts, name: start}.items()}
     assert error["blended"] < 0.7 * min(error["carried"], error["previous"])
+
+
+def test_cloth_that_slid_without_a_trace_returns_towards_the_skinned_pose(bound, body, poses, config, scan_of) -> None:
+    """A tube turned about its axis lies on the same surface: no distance to the scan tells it from the skinned pose."""
+    analysis = analyse_template(bound, config)
+    frame = 0
+    mover = Mover.create(analysis, body, poses)
+    skinned = mover.skinned(frame)
+    middle = skinned.mean(axis=0)
+    turn = Rotation.from_euler("y", 2, degrees=True)
+    slid = (turn.apply(skinned - middle) + middle).astype(np.float32)
+    transforms = pose_frame(mover.shaped, poses, frame).transforms
+    scan = prepare_frame(analysis, scan_of(lambda points: skin(points, weights_at(points), transforms)), config)
+    parts = _predictions(analysis, mover, frame, (slid, frame), config)
+    misfits = {name: _distances(scan, part[analysis.coarse_vertices]) for name, part in parts.items()}
+
+    def left(relax: float) -> float:
+        blend = _blend(analysis, parts, misfits, relax)
+        return float(np.linalg.norm(blend - skinned, axis=1).mean() / np.linalg.norm(slid - skinned, axis=1).mean())
+
+    np.testing.assert_allclose(left(0.0), 1.0, atol=1e-3)
+    assert 0.5 < left(0.4) < 0.95, "a part of the way, for some of the sliding is real"
