@@ -105,13 +105,14 @@ class StereoConfig:
 
     pods: int = 14
     """How many; they stand where the depth cameras of a rig of this size would."""
-    image_size: int = 768
-    """Width and height of the square images, pixels."""
+    image_size: int = 1280
+    """Width and height of the square images, pixels. With 768 the hems of scans end askew: matches there mix cloth and
+    leg within the matcher's window."""
     field_of_view_deg: float = 48.0
     """Full horizontal angle of view."""
     baseline_m: float = 0.2
     """Between the two cameras of a pod."""
-    supersampling: int = 2
+    supersampling: int = 1
     """Rays along each side of a pixel of the speckle images."""
     speckle_px: float = 0.9
     """Standard deviation of a speckle's profile, camera pixels."""
@@ -127,7 +128,7 @@ class StereoConfig:
     """Width of the matcher's window."""
     uniqueness_percent: int = 8
     """Margin by which the best disparity has to beat the others."""
-    speckle_window_px: int = 150
+    speckle_window_px: int = 400
     """Smaller islands of disparity are dropped."""
     refinement_steps: int = 4
     """Of the matches, on the intensities. Semi-global matching alone is up to 0.3 pixels off, towards whole ones; 4

@@ -76,7 +76,7 @@ def learn_shape_space(
         weights: 0 to 1 per vertex.
         rows: the frames to learn from.
     Raises:
-        InputError: fewer than two frames, or NaN among them.
+        InputError: fewer than two frames, none that differ, or NaN among them.
     """
     if len(rows) < 2:
         raise InputError(f"takes: expected at least 2 good frames to learn from, found {len(rows)}")
@@ -85,6 +85,8 @@ def learn_shape_space(
     space = ShapeSpace(mean, np.zeros((0, *mean.shape)), np.zeros(0))
     wanted = config.components or config.most_components
     space = _directions(source, space, wanted, config, rng)
+    if not len(space.std):
+        raise InputError(f"takes: expected frames that differ in the rest pose, found {len(rows)} that are all the same")
     if not source.has_gaps:
         return space
     spread = np.inf

@@ -1,7 +1,9 @@
 """One page that compares what gives a garment its surface, on the same held-out frames: WORK/compare/index.html.
 
 registration        the template as registered, without a map
-network             its maps made by a trained generator
+blendshapes         the registration, projected on a learned garment's principal directions
+regression          the learned garment from the pose alone
+network             the registration with maps made by a trained generator
 offset images       vertices decoded from an image that a network predicts from the pose alone, learned here
 fully connected     the same with a fully connected network on principal components
 
@@ -21,6 +23,7 @@ import numpy as np
 import torch
 
 from capture4d.app.compare_config import CompareConfig
+from capture4d.app.compare_garment import modelled_surfaces
 from capture4d.app.render import Drawn, heat_colours, render
 from capture4d.app.report_pictures import HEIGHT, WIDTH, Framing, Panel, colour_bar, data_uri
 from capture4d.atomic_files import file_digest, read_json, write_bytes, write_json
@@ -32,6 +35,7 @@ from capture4d.types import Body, PoseSequence, RegisteredSequence
 from capture4d.uv_layout import millimetres_per_texel
 from capture4d.work_folder import load_registration, registered_digest, work_capture
 from capture4d.workdir import open_stage
+from retarget.stage import GarmentModel, load_garment_model
 from wrinkles.apply_stage import generated_normals
 from wrinkles.config import MapConfig, PairConfig
 from wrinkles.display import fill_holes
@@ -49,7 +53,7 @@ from wrinkles.seams import seam_table
 
 __all__ = ["run"]
 
-SCHEMA = 1
+SCHEMA = 2
 ERROR_DEG = 30.0
 """Normal error at which the strip's colours saturate."""
 MB = 1e6
@@ -80,18 +84,30 @@ class _Row:
     model_mb: float
 
 
-def run(work: Path, model: Path, config: CompareConfig, *, workers: int = 1, overwrite: bool = False) -> Path:
+def run(
+    work: Path,
+    model: Path,
+    config: CompareConfig,
+    *,
+    garment_model: Path | None = None,
+    workers: int = 1,
+    overwrite: bool = False,
+) -> Path:
     """Learn the baselines, measure, draw; the path of the page.
 
     Args:
         model: folder of `capture4d wrinkles train`.
+        garment_model: what `capture4d fit` wrote; WORK/retarget, if there is one, by default.
     Raises:
-        InputError: the work folder lacks registration or scans, or the model is of another template.
+        InputError: the work folder lacks registration or scans, or a model is of another template.
     """
     weights = model / "generator.safetensors" if model.is_dir() else model
     generator = load_model(weights)
     ensure_pairs(work, PairConfig(map=MapConfig(size=generator.map_size)), workers=workers)
+    known = _garment_model(work, garment_model)
     upstream = {"registration": registered_digest(work), "model": file_digest([weights], root=weights.parent)}
+    if known is not None:
+        upstream["garment model"] = known.digest
     stage = open_stage(
         work / "compare", name="compare", schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite
     )
@@ -109,6 +125,15 @@ def run(work: Path, model: Path, config: CompareConfig, *, workers: int = 1, ove
     first = len(pairs.frame_ids) - len(held.frame_ids)
     rows = range(first, len(pairs.frame_ids))
     methods = [_registered(template, sequence, rows)]
+    moving = _moving(work, capture)
+    if known is not None and moving is not None:
+        methods += [
+            _drawn_by(
+                each.name, template, each.vertices, template.low_normals, each.megabytes,
+                extra_ms=each.ms_per_frame, has_map=False,
+            )
+            for each in modelled_surfaces(known, sequence, *moving, rows)
+        ]  # fmt: skip
     seams = seam_table(template.mesh, template.raster)
     methods.append(
         _drawn_by(
@@ -117,7 +142,6 @@ def run(work: Path, model: Path, config: CompareConfig, *, workers: int = 1, ove
             _megabytes(generator.generator),
         )
     )  # fmt: skip
-    moving = _moving(work, capture)
     if moving is not None and sequence.garment.skin_weights is not None:
         methods += _offset_methods(template, sequence, *moving, rows, len(learned.frame_ids), config)
     truth = _true_vertices(capture, held.frame_ids)
@@ -140,6 +164,12 @@ def run(work: Path, model: Path, config: CompareConfig, *, workers: int = 1, ove
     write_bytes(stage.path / "index.html", page.encode())
     stage.finish([stage.path / "index.html"])
     return stage.path / "index.html"
+
+
+def _garment_model(work: Path, path: Path | None) -> GarmentModel | None:
+    if path is None and not (work / "retarget" / "fit.json").is_file():
+        return None
+    return load_garment_model(work if path is None else path)
 
 
 def _model_split(model: Path, work: Path, config: CompareConfig) -> tuple[float, int]:

@@ -79,17 +79,27 @@ class WrinklesApply(StageOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class Compare(StageOptions):
-    """Compare registration, generated maps and offset images on the same held-out frames: one table, one page."""
+    """Compare registration, garment model, generated maps and offset images on the same held-out frames: one table, one
+    page."""
 
     work: Annotated[Positional[Path], arg(metavar="WORK")]
     """Work folder; holds garment/ and registration/, gets compare/."""
     model: Path
     """Model folder of `wrinkles train`."""
+    garment_model: Path | None = None
+    """What `fit` wrote; WORK/retarget, if there is one, by default."""
     config: Annotated[CompareConfig, arg(name="")] = field(default_factory=CompareConfig)
 
     def __call__(self) -> int:
         from capture4d.app.compare import run
 
-        page = run(self.work, self.model, self.config, workers=self.workers, overwrite=self.overwrite)
+        page = run(
+            self.work,
+            self.model,
+            self.config,
+            garment_model=self.garment_model,
+            workers=self.workers,
+            overwrite=self.overwrite,
+        )
         print(f"comparison: {page}")
         return 0

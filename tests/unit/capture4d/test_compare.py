@@ -35,10 +35,15 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     poses = PoseSequence(still, np.zeros((FRAMES, 3), np.float32), np.zeros(1, np.float32), ids, 60.0, body.joint_names)
     save_body(folder / "capture" / "body.npz", body)
     save_poses(folder / "capture" / "poses.npz", poses)
+    wobble = np.sin(np.arange(FRAMES))[:, None, None] * np.float32([0, 0, 1e-3])  # one direction to learn
+    np.save(work / "registration" / "vertices.npy", (garment.template.vertices + wobble).astype(np.float32))
+    records = "".join(json.dumps({"frame_id": frame_id, "verdict": "good"}) + "\n" for frame_id in ids.tolist())
+    (work / "registration" / "metrics.jsonl").write_text(records)
     for frame_id, scan in zip(ids.tolist(), scans, strict=True):
         colours = np.full((len(scan.vertices), 3), 120, np.uint8)
         write_scan(folder / "capture" / "scans" / f"{frame_id:06d}.ply", Scan(scan, colours, frame_id, 0.0))
     for arguments in (
+        ["fit", work, "--regressor", "linear", "--shape.components", "3"],
         ["wrinkles", "train", work, "--output", folder / "model", *SMALL],
         ["compare", work, "--model", folder / "model", "--image-texels", "32", "--epochs", "2", "--workers", "1"],
     ):
@@ -51,13 +56,18 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_every_surface_has_a_row(compared: Path):
     result = json.loads((compared / "compare.json").read_text())
     rows = {row["name"]: row for row in result["methods"]}
-    assert list(rows) == ["registration", "network", "offset images", "fully connected, PCA"]
+    assert list(rows) == [
+        "registration", "blendshapes", "regression", "network", "offset images", "fully connected, PCA",
+    ]  # fmt: skip
     # a fifth of eight frames was held out of the training, and those are compared
     assert result["frames"] == [7, 8]
     assert 4 < rows["registration"]["normal_deg"] < 12
     assert rows["registration"]["vertex_mm"] is None
     assert rows["network"]["vertex_mm"] == 0
     assert rows["network"]["model_mb"] > 0
+    # the wobble is one direction, and no pose tells of it
+    assert rows["blendshapes"]["vertex_mm"] < 1e-3
+    assert 0.2 < rows["regression"]["vertex_mm"] < 2
     # the sleeve does not move, so the mean of the offsets, which PCA starts from, is the sleeve
     assert rows["fully connected, PCA"]["vertex_mm"] < 5
     assert all(row["ms_per_frame"] > 0 for row in rows.values())
@@ -66,6 +76,6 @@ def test_every_surface_has_a_row(compared: Path):
 def test_the_page_stands_alone_and_shows_all(compared: Path):
     page = (compared / "index.html").read_text()
     assert "http" not in page.replace("https://www.w3.org", "")
-    assert page.count("<figure>") == 2 * (6 + 4)
+    assert page.count("<figure>") == 2 * (8 + 6)
     for name in ("scan", "network", "offset images", "map of the scan"):
         assert f"<figcaption>{name}</figcaption>" in page

@@ -150,6 +150,8 @@ def test_bad_numbers_are_one_line() -> None:
     space = learned(frames)
     with pytest.raises(InputError, match="at least 2 good frames"):
         learned(frames[:1])
+    with pytest.raises(InputError, match="4 that are all the same"):
+        learned(np.repeat(frames[:1], 4, axis=0))
     with pytest.raises(InputError, match="NaN or inf in 1 of 2 frames"):
         reconstruct(space.mean, space.basis, np.array([[0.0], [np.nan]]))
     with pytest.raises(InputError, match="at most 5, found 6"):
