@@ -99,8 +99,8 @@ class _Sheets:
 def border_beyond_rim(
     mesh: Mesh, garment: Bool[np.ndarray, " verts"], painted: Bool[np.ndarray, " verts"]
 ) -> Float64[np.ndarray, "points 3"]:
-    """Points on the border beyond a painted band of even width, one for each edge from garment to paint that tells where
-    it is.
+    """Points on the border beyond a painted band of even width: one for each edge from garment to paint, but for those
+    where the two fits disagree.
 
     Args:
         mesh: a scan that goes on beyond the border.

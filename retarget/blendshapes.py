@@ -86,7 +86,9 @@ def learn_shape_space(
     wanted = config.components or config.most_components
     space = _directions(source, space, wanted, config, rng)
     if not len(space.std):
-        raise InputError(f"takes: expected frames that differ in the rest pose, found {len(rows)} that are all the same")
+        raise InputError(
+            f"takes: expected frames that differ in the rest pose, found {len(rows)} that are all the same"
+        )
     if not source.has_gaps:
         return space
     spread = np.inf

@@ -1,5 +1,7 @@
 """One page that compares what gives a garment its surface, on the same held-out frames: WORK/compare/index.html.
 
+compare.json holds the table and names the pictures, which pictures/ keeps for the report.
+
 registration        the template as registered, without a map
 blendshapes         the registration, projected on a learned garment's principal directions
 regression          the learned garment from the pose alone
@@ -25,7 +27,7 @@ import torch
 from capture4d.app.compare_config import CompareConfig
 from capture4d.app.compare_garment import modelled_surfaces
 from capture4d.app.render import Drawn, heat_colours, render
-from capture4d.app.report_pictures import HEIGHT, WIDTH, Framing, Panel, colour_bar, data_uri
+from capture4d.app.report_pictures import HEIGHT, WIDTH, Framing, Panel, colour_bar, data_uri, write_panel
 from capture4d.atomic_files import file_digest, read_json, write_bytes, write_json
 from capture4d.body_stage import load_tracking
 from capture4d.errors import InputError
@@ -155,7 +157,12 @@ def run(
         )
         for at in chosen
     ]
-    write_json(stage.path / "compare.json", {"frames": held.frame_ids, "methods": [asdict(row) for row in table]})
+    kept = [{"frame_id": frame_id, "panels": _keep(stage.path, frame_id, panels)} for frame_id, panels, _ in frames]
+    rows_kept = [asdict(row) for row in table]
+    write_json(
+        stage.path / "compare.json",
+        {"frames": held.frame_ids, "against_truth": truth is not None, "methods": rows_kept, "pictures": kept},
+    )
     environment = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True)
     page = environment.get_template("compare.html.jinja").render(
         name=capture.name, rows=table, frames=frames, count=len(held.frame_ids), against_truth=truth is not None,
@@ -164,6 +171,16 @@ def run(
     write_bytes(stage.path / "index.html", page.encode())
     stage.finish([stage.path / "index.html"])
     return stage.path / "index.html"
+
+
+def _keep(folder: Path, frame_id: int, panels: Sequence[Panel]) -> list[dict[str, str]]:
+    """Write the pictures of a frame; their titles and files."""
+    kept = []
+    for number, panel in enumerate(panels):
+        path = folder / "pictures" / f"{frame_id:06d}-{number}.webp"
+        write_panel(path, panel)
+        kept.append({"title": panel.title, "file": path.name})
+    return kept
 
 
 def _garment_model(work: Path, path: Path | None) -> GarmentModel | None:
@@ -316,7 +333,7 @@ def _number(value: float) -> float | None:
 def _pictures(
     capture: Capture, template: MapTemplate, methods: Sequence[_Method], held: PairTake, at: int
 ) -> list[Panel]:
-    """The scan, every surface, and those with a map once more with it; the scan's own map last."""
+    """The scan, every surface, with its map if it has one, and the registration with its low map and the scan's."""
     frame_id = int(held.frame_ids[at])
     registered = methods[0].vertices
     span = np.ptp(registered.reshape(len(registered), -1, 3), axis=1).max(axis=0)
@@ -333,6 +350,7 @@ def _pictures(
     for method in methods:
         tangent = _tangent_image(template, method.normals[at], template.frames(method.vertices[at]))
         panels.append(Panel(method.name, drawn(method.vertices[at], tangent if method.has_map else None)))
+    panels.append(Panel("low map", drawn(registered[at], _tangent_image(template, methods[0].normals[at], frames))))
     valid = template.raster.read(held.valid[at, 0].numpy())
     world = template.raster.read(held.high[at].float().permute(1, 2, 0).numpy()) @ template.rotation(registered[at]).T
     high = fill_holes(_tangent_image(template, world, frames), template.raster.image(valid))

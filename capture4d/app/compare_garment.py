@@ -10,8 +10,8 @@ import numpy as np
 from capture4d.body import with_shape
 from capture4d.errors import InputError
 from capture4d.types import Body, PoseSequence, RegisteredSequence
-from retarget.bodies import captured_person, retargeted_mean
 from retarget.blendshapes import project, reconstruct, shape_space, skin_frames
+from retarget.bodies import captured_person, retargeted_mean
 from retarget.controls import control_vectors
 from retarget.pose_normalisation import PoseRows, unpose_sequence
 from retarget.stage import GarmentModel

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from capture4d.atomic_files import read_json
@@ -16,23 +17,38 @@ __all__ = ["broken_limits", "needs_tracking", "parse_limits", "run_all", "run_de
 
 BOARD_POSES = 16
 """Of the board that the demo calibrates with."""
+WRINKLE_STEPS = 500
+"""Of the small network: it shows how wrinkles are learned; good ones take thousands of steps and frames."""
+HELD_OUT = 0.15
+"""Share of the demo's frames that the network does not see."""
 OTHER_PERSON = (1.5, 2.0)
 """Whom the demo puts the garment on: taller and heavier than the captured subject."""
 
 
 def run_demo(output: Path, *, workers: int, overwrite: bool = False) -> tuple[Path, Path]:
     """Synthesise `output`/capture, calibrate its rig from photographs of a board, run everything on the scans, the true
-    poses left aside, learn the garment and put it on another body; the paths of the two reports."""
+    poses left aside, learn the garment and its wrinkles, compare what was learned, and put the garment on another body;
+    the paths of the two reports."""
+    from capture4d.app.compare import run as compare
+    from capture4d.app.compare_config import CompareConfig
     from data_synth.config import PRESETS
     from data_synth.stage import run as synthesise
     from retarget.animate_stage import run as animate
     from retarget.stage import run as fit
+    from wrinkles.config import PRESETS as WRINKLES
+    from wrinkles.train_stage import run as train_wrinkles
 
     synthesise(output / "capture", PRESETS["demo"], workers=workers, overwrite=overwrite)
     _calibrate_demo(output / "capture" / "rig.json", output / "rig", workers=workers, overwrite=overwrite)
-    report = run_all(output / "capture", output, RegistrationConfig(), track=True, workers=workers, overwrite=overwrite)
+    run_stages(output / "capture", output, RegistrationConfig(), track=True, workers=workers, overwrite=overwrite)
     quick = TrainingConfig(epochs=60, patience=20)
     fit([output], output / "retarget", FitConfig(training=quick), workers=workers, overwrite=overwrite)
+    network = WRINKLES["small"]
+    network = replace(network, held_out=HELD_OUT, schedule=replace(network.schedule, steps=WRINKLE_STEPS))
+    train_wrinkles([output], output / "wrinkles" / "model", network, workers=workers, overwrite=overwrite)
+    small = CompareConfig(held_out=HELD_OUT, image_texels=128, epochs=10)
+    compare(output, output / "wrinkles" / "model", small, workers=workers, overwrite=overwrite)
+    report = run_report(output, capture=output / "capture", workers=workers, overwrite=overwrite)
     animate(
         output / "retarget",
         output / "body" / "poses.npz",

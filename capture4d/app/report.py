@@ -21,7 +21,17 @@ import numpy as np
 from capture4d.app.charts import Line, line_chart
 from capture4d.app.report_metrics import METRICS, column, summarise, truth_measures
 from capture4d.app.report_pictures import Framing, Panel, colour_bar, draw_frame, readable_scan
-from capture4d.app.report_stages import Calibration, StagePictures, Tracking, calibration, draw_stages, tracking
+from capture4d.app.report_stages import (
+    Calibration,
+    Comparison,
+    StagePictures,
+    Tracking,
+    calibration,
+    comparison,
+    comparison_digest,
+    draw_stages,
+    tracking,
+)
 from capture4d.atomic_files import read_json, write_bytes, write_json
 from capture4d.evaluation import correspondence_errors, material_points
 from capture4d.scans import Capture, TruthModel, read_capture, read_truth_model, read_truth_vertices
@@ -32,7 +42,7 @@ from capture4d.workers import run_jobs
 
 __all__ = ["MAX_FLAGGED_ROWS", "ReportConfig", "flat", "is_current", "joined_chart", "run", "shown", "spread"]
 
-SCHEMA = 2
+SCHEMA = 3
 MAX_FLAGGED_ROWS = 60
 BLUE, ORANGE, GREEN, GREY = "#2f62c9", "#d9772b", "#2f8f5b", "#8d97a5"
 CURVES: tuple[tuple[str, float, tuple[tuple[str, str, str], ...]], ...] = (
@@ -68,11 +78,12 @@ CURVES: tuple[tuple[str, float, tuple[tuple[str, str, str], ...]], ...] = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stages:
-    """What came before registration."""
+    """What came before registration, and after."""
 
     calibration: Calibration | None
     tracking: Tracking | None
     pictures: Sequence[StagePictures]
+    comparison: Comparison | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +106,7 @@ def run(
     workers: int = 1,
     overwrite: bool = False,
 ) -> Path:
-    """Write the report, unless it is there and the registration has not changed; the path of its page.
+    """Write the report, unless it is there and what it shows has not changed; the path of its page.
 
     Args:
         work: folder with a finished registration/.
@@ -106,14 +117,16 @@ def run(
     folder = work / "report"
     place = capture_path(work) if capture is None else capture
     digest = require_complete(work / "registration", "register", f"capture4d register {place} --output {work}")
-    current = {"schema": SCHEMA, "config": asdict(config), "upstream": {"registration": digest}}
+    upstream = {"registration": digest}
+    compared = comparison_digest(work)
+    if compared is not None:
+        upstream["compare"] = compared
+    current = {"schema": SCHEMA, "config": asdict(config), "upstream": upstream}
     if not overwrite and is_current(folder, current):
         return folder / "index.html"
     description = read_capture(place)
     stale = (folder / "stage.json").exists()
-    stage = open_stage(
-        folder, name="report", schema=SCHEMA, config=config, upstream=current["upstream"], overwrite=stale
-    )
+    stage = open_stage(folder, name="report", schema=SCHEMA, config=config, upstream=upstream, overwrite=stale)
     records = load_records(work / "registration")
     _measure_truth(work, description, records, config, workers)
     tracked = tracking(description, work)
@@ -133,6 +146,7 @@ def run(
             spread(len(records), config.stage_pictures),
             workers=workers,
         ),
+        comparison(work),
     )
     write_json(
         folder / "metrics.json",
@@ -275,6 +289,7 @@ def _page(
         charts=list(_charts(records)),
         columns=2 + len(scales),
         calibration=stages.calibration,
+        comparison=stages.comparison,
         tracking=_tracking_part(stages.tracking),
         extraction=[{"frame_id": records[each.row]["frame_id"], "panels": each.extraction} for each in stages.pictures],
         tracked=[

@@ -5,22 +5,37 @@ from __future__ import annotations
 import base64
 import io
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32, UInt8
 from PIL import Image
 
 from capture4d.app.render import Direction, Drawn, View, frame_view, heat_colours, render, trace
+from capture4d.atomic_files import write_bytes
 from capture4d.errors import InputError
 from capture4d.scans import Capture, Colour, read_scan
 from capture4d.types import Garment, Scan
 
-__all__ = ["NO_SCAN", "VIEWS", "Framing", "Panel", "colour_bar", "data_uri", "draw_frame", "no_scan", "readable_scan"]
+__all__ = [
+    "NO_SCAN",
+    "VIEWS",
+    "Framing",
+    "Panel",
+    "colour_bar",
+    "data_uri",
+    "draw_frame",
+    "no_scan",
+    "read_panel",
+    "readable_scan",
+    "write_panel",
+]
 
 VIEWS: tuple[Direction, ...] = ("three_quarter", "back")
 WIDTH, HEIGHT = 400, 370
 CLOTH = (176, 190, 208)
 LOOP = (222, 140, 28)
+WEBP = "data:image/webp;base64,"
 NO_SCAN = "no scan"
 """Title of the empty picture of a frame whose scan cannot be read."""
 
@@ -99,7 +114,17 @@ def data_uri(picture: UInt8[np.ndarray, "height width 3"]) -> str:
     """A picture inside the page."""
     buffer = io.BytesIO()
     Image.fromarray(picture).save(buffer, "WEBP", quality=84, method=4)
-    return f"data:image/webp;base64,{base64.b64encode(buffer.getvalue()).decode()}"
+    return WEBP + base64.b64encode(buffer.getvalue()).decode()
+
+
+def write_panel(path: Path, panel: Panel) -> None:
+    """Keep a panel's picture as a file."""
+    write_bytes(path, base64.b64decode(panel.uri.removeprefix(WEBP)))
+
+
+def read_panel(path: Path, title: str) -> Panel:
+    """What `write_panel` wrote."""
+    return Panel(title, WEBP + base64.b64encode(path.read_bytes()).decode())
 
 
 def _cloth(garment: Garment, border_colours: dict[str, Colour]) -> np.ndarray:

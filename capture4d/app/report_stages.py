@@ -1,4 +1,4 @@
-"""What the report says about the stages before registration: calibration of the rig, tracking, extraction.
+"""What the report says about other stages: calibration of the rig, tracking, extraction, the comparison of surfaces.
 
 Each section is a value for the page's template, or None where the stage was not run.
 """
@@ -21,7 +21,7 @@ from capture4d.app.calibration_page import calibration_charts, calibration_tiles
 from capture4d.app.charts import Line, line_chart
 from capture4d.app.render import Drawn, render
 from capture4d.app.report_metrics import column
-from capture4d.app.report_pictures import VIEWS, Framing, Panel, data_uri, no_scan, readable_scan
+from capture4d.app.report_pictures import VIEWS, Framing, Panel, data_uri, no_scan, read_panel, readable_scan
 from capture4d.atomic_files import read_json
 from capture4d.body import pose_frame, with_shape
 from capture4d.body_stage import load_tracking
@@ -34,7 +34,18 @@ from capture4d.take_colours import KnownColours, take_colours
 from capture4d.types import Mesh, PoseSequence, RegisteredSequence
 from capture4d.workers import run_jobs
 
-__all__ = ["Calibration", "Section", "StagePictures", "Tracking", "calibration", "draw_stages", "tracking"]
+__all__ = [
+    "Calibration",
+    "Comparison",
+    "Section",
+    "StagePictures",
+    "Tracking",
+    "calibration",
+    "comparison",
+    "comparison_digest",
+    "draw_stages",
+    "tracking",
+]
 
 BLUE, ORANGE, GREEN, GREY = "#2f62c9", "#d9772b", "#2f8f5b", "#8d97a5"
 WIDTH, HEIGHT = 400, 370
@@ -87,6 +98,39 @@ def calibration(capture: Capture, work: Path) -> Calibration | None:
     ]
     note = "From rig.json; how certain it is, nothing here says. capture4d calibrate writes calibration.json beside it."
     return Calibration(Section(tiles, []), note)
+
+
+# --- comparison --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Comparison:
+    """Surfaces on the same held-out frames, as `capture4d compare` left them."""
+
+    frames: int
+    against_truth: bool
+    rows: Sequence[Mapping[str, Any]]
+    pictures: Sequence[tuple[int, Sequence[Panel]]]
+
+
+def comparison(work: Path) -> Comparison | None:
+    """What WORK/compare holds, if it is finished."""
+    folder = work / "compare"
+    if comparison_digest(work) is None:
+        return None
+    found = read_json(folder / "compare.json")
+    pictures = [
+        (frame["frame_id"], [read_panel(folder / "pictures" / each["file"], each["title"]) for each in frame["panels"]])
+        for frame in found["pictures"]
+    ]
+    return Comparison(len(found["frames"]), found["against_truth"], found["methods"], pictures)
+
+
+def comparison_digest(work: Path) -> str | None:
+    """Of a finished WORK/compare."""
+    path = work / "compare" / "stage.json"
+    record = read_json(path) if path.is_file() else {}
+    return record["digest"] if record.get("status") == "complete" else None
 
 
 # --- tracking ----------------------------------------------------------------------------------------------------

@@ -76,6 +76,6 @@ def test_every_surface_has_a_row(compared: Path):
 def test_the_page_stands_alone_and_shows_all(compared: Path):
     page = (compared / "index.html").read_text()
     assert "http" not in page.replace("https://www.w3.org", "")
-    assert page.count("<figure>") == 2 * (8 + 6)
+    assert page.count("<figure>") == 2 * (9 + 6)
     for name in ("scan", "network", "offset images", "map of the scan"):
         assert f"<figcaption>{name}</figcaption>" in page
