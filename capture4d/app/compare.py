@@ -4,7 +4,7 @@ compare.json holds the table and names the pictures, which pictures/ keeps for t
 
 registration        the template as registered, without a map
 blendshapes         the registration, projected on a learned garment's principal directions
-regression          the learned garment from the pose alone
+regression          the learned garment from the poses alone, linear and by the LSTM
 network             the registration with maps made by a trained generator
 offset images       vertices decoded from an image that a network predicts from the pose alone, learned here
 fully connected     the same with a fully connected network on principal components
@@ -25,9 +25,9 @@ import numpy as np
 import torch
 
 from capture4d.app.compare_config import CompareConfig
-from capture4d.app.compare_garment import modelled_surfaces
+from capture4d.app.compare_garment import Modelled, model_take
 from capture4d.app.render import Drawn, heat_colours, render
-from capture4d.app.report_pictures import HEIGHT, WIDTH, Framing, Panel, colour_bar, data_uri, write_panel
+from capture4d.app.report_pictures import CLOTH, HEIGHT, WIDTH, Framing, Panel, colour_bar, data_uri, write_panel
 from capture4d.atomic_files import file_digest, read_json, write_bytes, write_json
 from capture4d.body_stage import load_tracking
 from capture4d.errors import InputError
@@ -59,6 +59,7 @@ SCHEMA = 2
 ERROR_DEG = 30.0
 """Normal error at which the strip's colours saturate."""
 MB = 1e6
+SKIN = (214, 190, 172)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,13 +129,15 @@ def run(
     rows = range(first, len(pairs.frame_ids))
     methods = [_registered(template, sequence, rows)]
     moving = _moving(work, capture)
+    modelled: Modelled | None = None
     if known is not None and moving is not None:
+        modelled = model_take(known, sequence, *moving, rows)
         methods += [
             _drawn_by(
                 each.name, template, each.vertices, template.low_normals, each.megabytes,
                 extra_ms=each.ms_per_frame, has_map=False,
             )
-            for each in modelled_surfaces(known, sequence, *moving, rows)
+            for each in modelled.surfaces
         ]  # fmt: skip
     seams = seam_table(template.mesh, template.raster)
     methods.append(
@@ -157,27 +160,57 @@ def run(
         )
         for at in chosen
     ]
-    kept = [{"frame_id": frame_id, "panels": _keep(stage.path, frame_id, panels)} for frame_id, panels, _ in frames]
+    people = [] if modelled is None else _people(modelled, rows[len(rows) // 2])
+    middle = int(held.frame_ids[len(rows) // 2])
+    kept = [
+        {"frame_id": frame_id, "panels": _keep(stage.path, f"{frame_id:06d}", panels)} for frame_id, panels, _ in frames
+    ]
+    others = {"frame_id": middle, "panels": _keep(stage.path, "people", people)}
     rows_kept = [asdict(row) for row in table]
     write_json(
         stage.path / "compare.json",
-        {"frames": held.frame_ids, "against_truth": truth is not None, "methods": rows_kept, "pictures": kept},
+        {
+            "frames": held.frame_ids,
+            "against_truth": truth is not None,
+            "methods": rows_kept,
+            "pictures": kept,
+            "people": others,
+        },
     )
     environment = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True)
     page = environment.get_template("compare.html.jinja").render(
         name=capture.name, rows=table, frames=frames, count=len(held.frame_ids), against_truth=truth is not None,
-        error_deg=ERROR_DEG, bar=colour_bar(ERROR_DEG),
+        error_deg=ERROR_DEG, bar=colour_bar(ERROR_DEG), people=people, middle=middle,
     )  # fmt: skip
     write_bytes(stage.path / "index.html", page.encode())
     stage.finish([stage.path / "index.html"])
     return stage.path / "index.html"
 
 
-def _keep(folder: Path, frame_id: int, panels: Sequence[Panel]) -> list[dict[str, str]]:
-    """Write the pictures of a frame; their titles and files."""
+def _people(modelled: Modelled, row: int) -> list[Panel]:
+    """A frame on other people, all drawn at one scale."""
+    dressed = modelled.on_people(row)
+    spans = np.max([np.ptp(each.garment.vertices, axis=0) for each in dressed], axis=0).tolist()
+    framing = Framing((1.3 * spans[0], 1.15 * spans[1], 1.3 * spans[2]))
+    return [
+        Panel(
+            each.who,
+            data_uri(
+                render(
+                    [Drawn(each.garment, CLOTH), Drawn(each.body, SKIN)],
+                    framing.view(each.garment.vertices, "three_quarter"), width=WIDTH, height=HEIGHT,
+                )
+            ),
+        )
+        for each in dressed
+    ]  # fmt: skip
+
+
+def _keep(folder: Path, name: str, panels: Sequence[Panel]) -> list[dict[str, str]]:
+    """Write pictures; their titles and files."""
     kept = []
     for number, panel in enumerate(panels):
-        path = folder / "pictures" / f"{frame_id:06d}-{number}.webp"
+        path = folder / "pictures" / f"{name}-{number}.webp"
         write_panel(path, panel)
         kept.append({"title": panel.title, "file": path.name})
     return kept
@@ -333,7 +366,8 @@ def _number(value: float) -> float | None:
 def _pictures(
     capture: Capture, template: MapTemplate, methods: Sequence[_Method], held: PairTake, at: int
 ) -> list[Panel]:
-    """The scan, every surface, with its map if it has one, and the registration with its low map and the scan's."""
+    """The scan, the truth if there is one, every surface, with its map if it has one, and the registration with its low
+    map and with the scan's."""
     frame_id = int(held.frame_ids[at])
     registered = methods[0].vertices
     span = np.ptp(registered.reshape(len(registered), -1, 3), axis=1).max(axis=0)
@@ -347,6 +381,10 @@ def _pictures(
 
     frames = template.frames(registered[at])
     panels = [Panel("scan", data_uri(render([Drawn(scan.mesh, scan.colours)], view, width=WIDTH, height=HEIGHT)))]
+    model = read_truth_model(capture)
+    if model is not None:
+        fine = model.fine.with_vertices(read_truth_vertices(capture, frame_id))
+        panels.append(Panel("truth", data_uri(render([Drawn(fine)], view, width=WIDTH, height=HEIGHT))))
     for method in methods:
         tangent = _tangent_image(template, method.normals[at], template.frames(method.vertices[at]))
         panels.append(Panel(method.name, drawn(method.vertices[at], tangent if method.has_map else None)))

@@ -15,7 +15,7 @@ class CompareConfig:
     """Share of frames at the end of the take that nothing is learned from here. A network keeps its own split."""
     gap: int = 10
     """Frames between the two that belong to neither."""
-    pictures: int = 2
+    pictures: int = 3
     """Held-out frames drawn."""
     image_texels: int = 256
     """Side of the offset images."""

@@ -1,22 +1,28 @@
-"""The garment model among the surfaces that `compare` sets side by side: its blendshapes, and its regression."""
+"""The garment model among the surfaces that `compare` sets side by side: blendshapes, regressions, other people."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from capture4d.body import with_shape
+from capture4d.body import pose_frame, with_shape
 from capture4d.errors import InputError
-from capture4d.types import Body, PoseSequence, RegisteredSequence
+from capture4d.types import Body, Mesh, PoseSequence, RegisteredSequence
+from retarget.animation import Animator
 from retarget.blendshapes import project, reconstruct, shape_space, skin_frames
 from retarget.bodies import captured_person, retargeted_mean
+from retarget.config import AnimateConfig
 from retarget.controls import control_vectors
 from retarget.pose_normalisation import PoseRows, unpose_sequence
 from retarget.stage import GarmentModel
 
-__all__ = ["ModelledSurface", "modelled_surfaces"]
+__all__ = ["PEOPLE", "Dressed", "Modelled", "ModelledSurface", "model_take"]
+
+PEOPLE = {"as captured": None, "thin": (0.0, -2.0), "heavy": (0.0, 2.0), "tall": (1.5, 0.0), "short": (-1.5, 0.0)}
+"""Whom the garment is shown on: first coefficients of their shape."""
 
 UNSEEN_WEIGHT = 0.05
 """Of vertices without scan data when a frame is projected on the blendshapes, as in `capture4d fit`."""
@@ -34,15 +40,55 @@ class ModelledSurface:
     megabytes: float
 
 
-def modelled_surfaces(
+@dataclass(frozen=True, slots=True, eq=False)
+class Dressed:
+    """One moment on one person."""
+
+    who: str
+    garment: Mesh
+    body: Mesh
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Modelled:
+    """A take as the model has it."""
+
+    known: GarmentModel
+    poses: PoseSequence
+    """Of the take, in the order of its registered frames."""
+    rows: range
+    surfaces: Sequence[ModelledSurface]
+    coefficients: np.ndarray
+    """(T, K) float32 of all frames, from the poses, by the LSTM if the model has one."""
+
+    def on_people(self, row: int) -> list[Dressed]:
+        """A frame of the take on other people, out of their bodies."""
+        model, body = self.known.model, self.known.body
+        captured = captured_person(model, body)
+        dressed = []
+        for who, first in PEOPLE.items():
+            shape = captured.shape.copy()
+            if first is not None:
+                shape[:] = 0
+                shape[: len(first)] = first[: len(shape)]
+            person = with_shape(body, shape)
+            animator = Animator(model, person, retargeted_mean(model, captured, person), AnimateConfig())
+            (frame,) = animator.frames(self.poses, self.coefficients, [row])
+            posed = pose_frame(person, self.poses, row).vertices().astype(np.float32)
+            garment = model.garment.template.with_vertices(frame.vertices)
+            dressed.append(Dressed(who, garment, body.template.with_vertices(posed)))
+        return dressed
+
+
+def model_take(
     known: GarmentModel, sequence: RegisteredSequence, body: Body, poses: PoseSequence, rows: range
-) -> list[ModelledSurface]:
+) -> Modelled:
     """Blendshapes: the registered frames, projected on the model's directions. Regression: the garment from the poses
-    alone, by the LSTM if the model has one.
+    alone.
 
     Args:
         sequence, body, poses: a registered take, and what moved it.
-        rows: frames of the sequence that are wanted; the regression sees the motion from the take's beginning.
+        rows: frames of the sequence that are wanted; regressions see the motion from the take's beginning.
     Raises:
         InputError: the model is of another template or skeleton.
     """
@@ -58,31 +104,27 @@ def modelled_surfaces(
     matched = PoseRows.match(sequence, with_shape(body, poses.shape), poses)
     unposed = list(unpose_sequence(sequence, matched, person.shape, unseen_weight=UNSEEN_WEIGHT))
     frames, seen = (np.stack([unposed[row][part] for row in rows]) for part in (0, 1))
-    regressor = known.linear if known.lstm is None else known.lstm
-    controls = control_vectors(regressor.layout, matched.poses)
+    answers = {"blendshapes": (project(shape_space(model), frames, seen).astype(np.float32), 0.0, 0)}
+    coefficients = np.zeros((0, 0), np.float32)
+    for name, regressor in (("linear", known.linear), ("LSTM", known.lstm)):
+        if regressor is None:
+            continue
+        controls = control_vectors(regressor.layout, matched.poses)
+        begin = time.perf_counter()
+        coefficients = regressor.predict(controls)
+        ms = 1e3 * (time.perf_counter() - begin) / len(controls)
+        size = (known.folder / f"{name.lower()}.safetensors").stat().st_size
+        answers[f"regression, {name}"] = coefficients[rows.start : rows.stop], ms, size
     mean = retargeted_mean(model, person, matched.shaped).astype(np.float32)  # on the person as this take was tracked
-    begin = time.perf_counter()
-    predicted = regressor.predict(controls)
-    ms = 1e3 * (time.perf_counter() - begin) / len(controls)
-    answers = (
-        ("blendshapes", project(shape_space(model), frames, seen), 0.0, 0),
-        ("regression", predicted[rows.start : rows.stop], ms, _regressor_size(known)),
-    )
     surfaces = []
-    for name, coefficients, extra_ms, size in answers:
+    for name, (wanted, extra_ms, size) in answers.items():
         vertices, times = [], []
-        for row, wanted in zip(rows, coefficients, strict=True):
+        for row, each in zip(rows, wanted, strict=True):
             begin = time.perf_counter()
-            rest = reconstruct(mean, model.basis, wanted[None])
+            rest = reconstruct(mean, model.basis, each[None])
             placed = skin_frames(rest, weights, matched.transforms(row)[None])
             times.append(1e3 * (time.perf_counter() - begin))
             vertices.append(placed[0])
         megabytes = (model.basis.nbytes + model.mean.nbytes + size) / MB
         surfaces.append(ModelledSurface(name, np.stack(vertices), float(np.median(times)) + extra_ms, megabytes))
-    return surfaces
-
-
-def _regressor_size(known: GarmentModel) -> int:
-    """Of the regressor's file, bytes."""
-    name = "linear.safetensors" if known.lstm is None else "lstm.safetensors"
-    return (known.folder / name).stat().st_size
+    return Modelled(known, matched.poses, rows, surfaces, coefficients)

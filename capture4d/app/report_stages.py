@@ -111,6 +111,8 @@ class Comparison:
     against_truth: bool
     rows: Sequence[Mapping[str, Any]]
     pictures: Sequence[tuple[int, Sequence[Panel]]]
+    people: Sequence[Panel]
+    people_frame: int
 
 
 def comparison(work: Path) -> Comparison | None:
@@ -119,11 +121,18 @@ def comparison(work: Path) -> Comparison | None:
     if comparison_digest(work) is None:
         return None
     found = read_json(folder / "compare.json")
-    pictures = [
-        (frame["frame_id"], [read_panel(folder / "pictures" / each["file"], each["title"]) for each in frame["panels"]])
-        for frame in found["pictures"]
-    ]
-    return Comparison(len(found["frames"]), found["against_truth"], found["methods"], pictures)
+
+    def panels(group: Mapping[str, Any]) -> list[Panel]:
+        return [read_panel(folder / "pictures" / each["file"], each["title"]) for each in group["panels"]]
+
+    return Comparison(
+        len(found["frames"]),
+        found["against_truth"],
+        found["methods"],
+        [(frame["frame_id"], panels(frame)) for frame in found["pictures"]],
+        panels(found["people"]),
+        found["people"]["frame_id"],
+    )
 
 
 def comparison_digest(work: Path) -> str | None:

@@ -9,6 +9,7 @@ import pytest
 from capture4d.app.charts import Line, line_chart, nice_ticks
 from capture4d.app.report import ReportConfig, run
 from capture4d.app.report_metrics import summarise
+from capture4d.app.report_pictures import Panel, data_uri, write_panel
 from capture4d.atomic_files import write_bytes, write_json, write_npy, write_npz
 from capture4d.body_anny import load_anny
 from capture4d.errors import InputError
@@ -111,6 +112,27 @@ def test_the_page_stands_alone_and_shows_what_it_should(work):
     for chart in re.findall(r"<svg.*?</svg>", page, re.DOTALL):
         ElementTree.fromstring(chart)
     assert (work / "report" / "index.html").stat().st_size < 2e6
+
+
+def test_a_comparison_is_shown_and_makes_the_report_anew(work):
+    config = ReportConfig(pictures=1, truth_frames=1)
+    assert "Surfaces compared" not in run(work, config=config).read_text()
+    stage = open_stage(work / "compare", name="compare", schema=1, config=None, upstream={})
+    write_panel(stage.path / "pictures" / "a.webp", Panel("map of the scan", data_uri(np.zeros((8, 8, 3), np.uint8))))
+    row = {"name": "network", "vertex_mm": None, "normal_deg": 7.25, "wrinkle_energy_kept": 0.5, "flicker_deg": 1,
+           "ms_per_frame": 3, "model_mb": 2}  # fmt: skip
+    picture = {"frame_id": 7, "panels": [{"title": "map of the scan", "file": "a.webp"}]}
+    write_json(
+        stage.path / "compare.json",
+        {"frames": [6, 7], "against_truth": False, "methods": [row], "pictures": [picture], "people": picture},
+    )
+    assert "Surfaces compared" not in run(work, config=config).read_text(), "the comparison is not finished"
+    stage.finish([stage.path / "compare.json"])
+    page = run(work, config=config).read_text()
+    assert "On 2 held-out frames" in page
+    assert 'alt="map of the scan, frame 7"' in page
+    assert "Frame 7, from its pose, on five people" in page
+    assert re.search(r"<td>network</td>.*–.*7\.25", page)
 
 
 def test_a_report_is_made_once(work):
