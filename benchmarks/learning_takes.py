@@ -29,7 +29,7 @@ from retarget.learning import Take, UnposedTakes
 from retarget.pose_normalisation import PoseRows, unpose_sequence
 from retarget.splits import Piece, Role
 
-__all__ = ["Lesson", "lesson", "training_set", "true_places", "true_take"]
+__all__ = ["Lesson", "learned_takes", "lesson", "registered_takes", "training_set", "true_places", "true_take"]
 
 UNSEEN_WEIGHT = 0.05
 
@@ -53,6 +53,26 @@ def training_set(*, quick: bool, workers: int) -> tuple[TrainingSetConfig, Path]
     return config, cached_training_set(config, workers=workers)
 
 
+def learned_takes(config: TrainingSetConfig) -> list[str]:
+    """The clips that may be learned from."""
+    return [name for name in config.takes if name not in config.held_out and name not in config.reversed]
+
+
+def registered_takes(
+    config: TrainingSetConfig, folder: Path, names: Sequence[str], *, tracked: bool, workers: int
+) -> list[Path]:
+    """The work folders of some clips, beside the set; what is there already costs seconds.
+
+    Args:
+        tracked: register with the body that was tracked, not with the poses of the capture.
+    """
+    works = []
+    for name in names:
+        works.append(folder / "works" / name)
+        run_stages(folder / "takes" / name, works[-1], RegistrationConfig(), track=tracked, workers=workers)
+    return works
+
+
 def lesson(config: TrainingSetConfig, folder: Path, *, truth: bool, tracked: bool, workers: int) -> Lesson:
     """The takes of a set.
 
@@ -67,8 +87,7 @@ def lesson(config: TrainingSetConfig, folder: Path, *, truth: bool, tracked: boo
         if truth:
             sequences.append(true_take(capture))
         else:
-            work = folder / "works" / name
-            run_stages(capture.path, work, RegistrationConfig(), track=tracked, workers=workers)
+            (work,) = registered_takes(config, folder, [name], tracked=tracked, workers=workers)
             body, poses = load_moving_body(work)
             good = np.array([record["verdict"] == "good" for record in load_records(work / "registration")])
             sequences.append((load_registration(work / "registration"), with_shape(body, poses.shape), poses, good))
@@ -85,7 +104,7 @@ def lesson(config: TrainingSetConfig, folder: Path, *, truth: bool, tracked: boo
     skin_weights = registered.garment.skin_weights
     assert skin_weights is not None
     unposed = UnposedTakes(takes, np.stack(frames), np.stack(weights), skin_weights)
-    pieces = [Piece(take, range(len(each.good)), _role(names[take], config, names)) for take, each in enumerate(takes)]
+    pieces = [Piece(take, range(len(each.good)), _role(names[take], config)) for take, each in enumerate(takes)]
     backwards = tuple(piece for piece in pieces if names[piece.take] in config.reversed)
     return Lesson(
         unposed,
@@ -96,12 +115,11 @@ def lesson(config: TrainingSetConfig, folder: Path, *, truth: bool, tracked: boo
     )
 
 
-def _role(name: str, config: TrainingSetConfig, names: Sequence[str]) -> Role:
+def _role(name: str, config: TrainingSetConfig) -> Role:
     """The last clip that is learned from validates."""
     if name in config.held_out or name in config.reversed:
         return "held out"
-    learned = [each for each in names if each not in config.held_out and each not in config.reversed]
-    return "validation" if name == learned[-1] else "training"
+    return "validation" if name == learned_takes(config)[-1] else "training"
 
 
 def true_take(capture: Capture) -> tuple[RegisteredSequence, ShapedBody, PoseSequence, np.ndarray]:

@@ -16,11 +16,13 @@ import numpy as np
 import torch
 from torch import nn
 
+from benchmarks.learning_takes import learned_takes, registered_takes, training_set
 from benchmarks.metric import Metric
 from benchmarks.registered_work import QUICK_TAKE, registered_work
+from capture4d.body import with_shape
 from capture4d.errors import InputError
-from capture4d.scans import read_body, read_poses
-from capture4d.work_folder import load_registration, work_capture
+from capture4d.work_folder import load_moving_body, load_registration
+from retarget.pose_normalisation import PoseRows
 from wrinkles.offset_images import OffsetLayout, OffsetSampler
 from wrinkles.offset_networks import FullyConnected, ImageDecoder, PcaFullyConnected
 from wrinkles.offset_training import (
@@ -56,14 +58,21 @@ def run(
 
     Args:
         quick: nine frames of a small take to learn, three to test; images of 64 texels are learned, 256 measured.
-        train, test: work folders of one garment and subject; their captures hold the poses.
+        train, test: work folders of one garment and subject; none: the clips of `tshirt-train`, registered from their
+            scans with tracked bodies, and its held-out ones.
         size: texels along the side of the images that are learned.
     """
     if quick:
         works, epochs, size = (registered_work(QUICK_TAKE, workers=workers)[1],), 60, 64
         tests: tuple[Path, ...] = works
+    elif not (train or test):
+        config, folder = training_set(quick=False, workers=workers)
+        works, tests = (
+            tuple(registered_takes(config, folder, names, tracked=True, workers=workers))
+            for names in (learned_takes(config), config.held_out)
+        )
     elif not (train and test):
-        raise InputError("benchmarks offsets: expected --train and --test with work folders, or --quick")
+        raise InputError("benchmarks offsets: expected --train and --test together, or neither")
     else:
         works, tests = train, test
     torch.set_num_threads(workers)
@@ -108,27 +117,17 @@ def run(
 
 
 def _joints(work: Path) -> np.ndarray:
-    poses, garment = read_poses(work_capture(work)), load_registration(work / "registration").garment
-    if poses is None or garment.skin_weights is None:
-        raise InputError(f"{work}: expected a capture with poses, and a template bound to its body")
-    return pose_joints(poses, garment.skin_weights)
+    garment = load_registration(work / "registration").garment
+    if garment.skin_weights is None:
+        raise InputError(f"{work}: expected a template that is bound to a body")
+    return pose_joints(load_moving_body(work)[1], garment.skin_weights)
 
 
 def _frames(layout: OffsetLayout, work: Path, joints: np.ndarray) -> OffsetFrames:
-    capture, sequence = work_capture(work), load_registration(work / "registration")
-    poses, body = read_poses(capture), read_body(capture)
-    assert poses is not None
-    assert body is not None
-    rows = [poses.frame_ids.tolist().index(frame_id) for frame_id in sequence.frame_ids.tolist()]
-    chosen = type(poses)(
-        poses.rotations[rows],
-        poses.translations[rows],
-        poses.shape,
-        poses.frame_ids[rows],
-        poses.fps,
-        poses.joint_names,
-    )
-    return offset_frames(layout, body, chosen, np.array(sequence.vertices), joints)
+    sequence = load_registration(work / "registration")
+    body, poses = load_moving_body(work)
+    rows = PoseRows.match(sequence, with_shape(body, poses.shape), poses)
+    return offset_frames(layout, body, rows.poses, np.array(sequence.vertices), joints)
 
 
 def _joined(parts: list[OffsetFrames]) -> OffsetFrames:
