@@ -46,6 +46,20 @@ def test_the_border_is_carried_on_from_the_inner_rim(bend_m: float, holes: int, 
     assert gaps.max() < 0.01  # also behind holes
 
 
+def test_where_the_band_is_curled_nothing_is_said() -> None:
+    """There the border is neither where the cloth above points to, nor where the band does."""
+    mesh, cloth, painted = bent_strip(np.random.default_rng(5), bend_m=0.0)
+    vertices = mesh.vertices.copy()
+    curled = (vertices[:, 0] > 0.12) & (vertices[:, 0] < 0.18) & (vertices[:, 1] > -WIDTH)
+    angle = (vertices[curled, 1] + WIDTH) / 0.005
+    vertices[curled, 1:] = np.column_stack([0.005 * np.sin(angle) - WIDTH, 0.005 * (1 - np.cos(angle))])
+    border = border_beyond_rim(Mesh(vertices, mesh.faces), cloth, painted)
+    assert not ((border[:, 0] > 0.135) & (border[:, 0] < 0.165)).any()
+    for flat in (border[border[:, 0] < 0.1], border[border[:, 0] > 0.2]):
+        assert len(flat) > 40
+        assert np.abs(flat[:, 1:]).max() < 0.002
+
+
 def test_the_border_moves_with_the_strip() -> None:
     rng = np.random.default_rng(3)
     mesh, cloth, painted = bent_strip(rng, bend_m=0.003)
