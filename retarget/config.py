@@ -75,7 +75,8 @@ class LinearConfig:
 class LstmConfig:
     """The sequence-to-sequence network: encoder and decoder of the same size."""
 
-    layers: int = 4
+    layers: int = 1
+    """The paper has 4; on a thousand frames they generalise worse than one."""
     size: int = 256
     window: int = 3
     """Frames in and frames out."""
@@ -87,10 +88,14 @@ class LstmConfig:
 class TrainingConfig:
     """One training run."""
 
-    epochs: int = 400
-    batch: int = 64
+    epochs: int = 0
+    """The learning rate falls to zero over them, along a cosine. 0: thirty, or as many as make 500 steps."""
+    batch: int = 128
     learning_rate: float = 1e-3
-    weight_decay: float = 0.0
+    weight_decay: float = 2.0
+    """Decoupled from the gradient (AdamW)."""
+    control_noise: float = 0.15
+    """Standard deviation of noise on the standardised controls, drawn anew for every window."""
     teacher_forcing: float = 0.0
     """Probability that a step of the decoder is given the true coefficients of the step before, not its own."""
     loss: Literal["coefficients", "whitened"] = "coefficients"
@@ -115,6 +120,9 @@ class FitConfig:
     """A note on who may use the model, kept in its file."""
     regressor: Literal["both", "linear"] = "both"
     """Leave the LSTM out with `linear`."""
+    mirror: Literal["auto", "on", "off"] = "auto"
+    """Whether regressors learn from the takes seen in a mirror as well; `auto`: if skeleton and garment have two sides
+    that are alike."""
     shape: ShapeConfig = field(default_factory=ShapeConfig)
     split: SplitConfig = field(default_factory=SplitConfig)
     control: ControlConfig = field(default_factory=ControlConfig)

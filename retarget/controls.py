@@ -58,9 +58,20 @@ class ControlLayout:
     @property
     def size(self) -> int:
         """Numbers of a control vector, without the history."""
-        joints = len(self.joints)
-        motion = 6 if self.config.root_motion else 0
-        return 6 * joints + motion + 3 * self.config.up + 3 * (joints + 1) * self.config.joint_velocity
+        return sum(self.kinds)
+
+    @property
+    def kinds(self) -> tuple[int, ...]:
+        """How many numbers there are of each unit: rotations, velocity, acceleration, gravity, turning."""
+        config = self.config
+        counts = (
+            6 * len(self.joints),
+            3 * config.root_motion,
+            3 * config.root_motion,
+            3 * config.up,
+            3 * (len(self.joints) + 1) * config.joint_velocity,
+        )
+        return tuple(count for count in counts if count)
 
     def require(self, poses: PoseSequence) -> None:
         """

@@ -15,6 +15,7 @@ from capture4d.types import PoseSequence
 from retarget.blendshapes import ShapeSpace, fewest_directions, learn_shape_space, posed_errors, project
 from retarget.config import ShapeConfig
 from retarget.controls import ControlLayout, control_vectors
+from retarget.mirroring import Mirror
 from retarget.pose_range import PoseRange, nearest_poses, pose_quaternions
 from retarget.regressors import Clip, Regressor
 from retarget.splits import Piece, Role
@@ -23,6 +24,7 @@ __all__ = [
     "Take",
     "UnposedTakes",
     "learn_shapes",
+    "mirrored_clips",
     "predictions",
     "regression_clips",
     "training_poses",
@@ -106,6 +108,24 @@ def regression_clips(
     return clips
 
 
+def mirrored_clips(
+    takes: UnposedTakes, pieces: Sequence[Piece], layout: ControlLayout, space: ShapeSpace, mirror: Mirror
+) -> list[Clip]:
+    """The training pieces, seen in a mirror."""
+    clips = []
+    for piece in pieces:
+        if piece.role != "training":
+            continue
+        take, kept = takes.takes[piece.take], slice(piece.frames.start, piece.frames.stop)
+        good = take.good[kept]
+        rows = takes.start(piece.take) + piece.frames.start + np.flatnonzero(good)
+        coefficients = np.zeros((len(good), len(space.basis)), np.float32)
+        if len(rows):
+            coefficients[good] = project(space, *mirror.frames(takes.vertices[rows], takes.weights[rows]))
+        clips.append(Clip(control_vectors(layout, mirror.poses(take.poses))[kept], coefficients, good))
+    return clips
+
+
 def vertex_error_m(
     takes: UnposedTakes,
     pieces: Sequence[Piece],
@@ -132,20 +152,23 @@ def vertex_error_m(
     return total / max(count, 1)
 
 
-def training_poses(takes: UnposedTakes, pieces: Sequence[Piece], layout: ControlLayout) -> PoseRange:
+def training_poses(
+    takes: UnposedTakes, pieces: Sequence[Piece], layout: ControlLayout, mirror: Mirror | None = None
+) -> PoseRange:
     """The poses that were learned from, and how far away from them the validation frames were."""
 
-    def quaternions(role: Role) -> np.ndarray:
-        found = [
-            pose_quaternions(
-                takes.takes[piece.take].poses.rotations[piece.frames.start : piece.frames.stop], layout.joints
-            )
-            for piece in pieces
-            if piece.role == role
-        ]
-        return np.concatenate([np.zeros((0, len(layout.joints), 4), np.float32), *found])
+    def quaternions(role: Role, mirror: Mirror | None) -> np.ndarray:
+        found = [np.zeros((0, len(layout.joints), 4), np.float32)]
+        for piece in pieces:
+            if piece.role == role:
+                poses = takes.takes[piece.take].poses
+                rotations = (poses if mirror is None else mirror.poses(poses)).rotations
+                found.append(pose_quaternions(rotations[piece.frames.start : piece.frames.stop], layout.joints))
+        return np.concatenate(found)
 
-    known, validated = quaternions("training"), quaternions("validation")
+    known, validated = quaternions("training", None), quaternions("validation", None)
+    if mirror is not None:
+        known = np.concatenate([known, quaternions("training", mirror)])
     distances, _ = nearest_poses(validated, known)
     return PoseRange(known, layout.joints, float(np.percentile(distances, 95)) if len(distances) else 0.0)
 

@@ -81,7 +81,7 @@ def fit_linear(
     wanted = np.concatenate([clip.coefficients[clip.good] for clip in known]).astype(np.float64)
     if len(controls) < 2:
         raise InputError(f"takes: expected at least 2 good frames to learn from, found {len(controls)}")
-    scales = Scales.of(controls, whole)
+    scales = Scales.of(controls, whole, layout)
     if config.fit == "moore-penrose":
         plain = Scales(np.zeros_like(scales.control_mean), np.ones_like(scales.control_std), scales.std)
         matrix = np.linalg.pinv(controls) @ wanted

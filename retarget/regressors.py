@@ -24,6 +24,10 @@ from retarget.controls import ControlLayout
 __all__ = ["Clip", "History", "Regressor", "Scales", "Stream", "read_regressor", "with_history", "write_regressor"]
 
 
+LEAST_LIVELY = 0.2
+"""Share of the largest standard deviation of a kind of controls by which each of them is divided at least."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Clip:
     """Consecutive frames to learn from or to be measured on."""
@@ -68,14 +72,23 @@ class Scales:
     std: Float32[np.ndarray, " shapes"]
 
     @staticmethod
-    def of(controls: Float[np.ndarray, "frames controls"], std: Float[np.ndarray, " shapes"]) -> Scales:
-        """Controls that hardly move are left as small as they are, not blown up."""
+    def of(
+        controls: Float[np.ndarray, "frames controls"], std: Float[np.ndarray, " shapes"], layout: ControlLayout
+    ) -> Scales:
+        """Controls that move little, beside the liveliest of their kind, are left small, not blown up: what a leg that
+        hardly moved says about a shirt is wrong in a new motion.
+        """
         spread = controls.std(axis=0)
-        floor = max(1e-3 * float(spread.max(initial=0.0)), 1e-6)
+        start = 0
+        for count in (*layout.kinds, len(spread) - layout.size):  # the history behind them is whitened already
+            kind = slice(start, start + count)
+            liveliest = float(spread[kind].max(initial=0.0))
+            spread[kind] = np.maximum(spread[kind], max(LEAST_LIVELY * liveliest, 1e-6))
+            start += count
         whole = np.asarray(std, np.float32)
         return Scales(
             controls.mean(axis=0).astype(np.float32),
-            np.maximum(spread, floor).astype(np.float32),
+            spread.astype(np.float32),
             np.maximum(whole, np.float32(1e-6) * whole.max(initial=np.float32(1e-6))),
         )
 

@@ -14,7 +14,7 @@ fit.json                   what was learned from, how many directions, and the e
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -39,12 +39,14 @@ from retarget.learning import (
     Take,
     UnposedTakes,
     learn_shapes,
+    mirrored_clips,
     predictions,
     regression_clips,
     training_poses,
     vertex_error_m,
 )
 from retarget.linear import LinearRegressor, fit_linear, load_linear, mean_squared_error, save_linear
+from retarget.mirroring import Mirror, find_mirror
 from retarget.pose_normalisation import PoseRows, unpose_sequence
 from retarget.pose_range import PoseRange, load_pose_range, save_pose_range
 from retarget.regressors import Clip, Regressor
@@ -52,7 +54,7 @@ from retarget.splits import ROLES, Piece, Role, split_takes
 
 __all__ = ["GarmentModel", "load_garment_model", "run"]
 
-SCHEMA = 1
+SCHEMA = 2
 MODEL, LINEAR, LSTM, POSES = (f"{name}.safetensors" for name in ("blendshapes", "linear", "lstm", "poses"))
 
 
@@ -101,9 +103,10 @@ def run(
         takes.takes[0].poses.fps,
         config.control,
     )
-    known = training_poses(takes, pieces, layout)
+    mirror = find_mirror(model.garment.template.with_vertices(model.mean), body.joint_names, config.mirror)
+    known = training_poses(takes, pieces, layout, mirror)
     save_pose_range(output / POSES, known, model_digest=_digest(output))
-    note = shape_note | _regressors(stage, takes, pieces, layout, shape_space(model), config, device)
+    note = shape_note | _regressors(stage, takes, pieces, layout, shape_space(model), mirror, config, device)
     split = {role: [_piece_name(names, piece) for piece in pieces if piece.role == role]
              for role in ROLES}  # fmt: skip
     write_json(output / "fit.json", {"split": split, "validated_deg": known.validated_deg, **note})
@@ -247,18 +250,28 @@ def _regressors(
     pieces: Sequence[Piece],
     layout: ControlLayout,
     space: ShapeSpace,
+    mirror: Mirror | None,
     config: FitConfig,
     device: str,
 ) -> dict[str, Any]:
     """Learn what is not there yet, and measure all of it."""
     digest = _digest(stage.path)
     clips: dict[Role, list[Clip]] = {role: regression_clips(takes, pieces, role, layout, space) for role in ROLES}
-    linear = fit_linear(clips["training"], clips["validation"], layout, space.std, config.linear)
+    training = list(clips["training"])
+    if mirror is not None:
+        training += mirrored_clips(takes, pieces, layout, space, mirror)
+    linear = fit_linear(training, clips["validation"], layout, space.std, config.linear)
     save_linear(stage.path / LINEAR, linear, model_digest=digest)
     regressors: dict[str, Regressor] = {"linear": linear}
     if config.regressor == "both":
-        regressors["lstm"] = _network(stage, clips, layout, space, linear, config, device, digest)
-    note: dict[str, Any] = {"control_numbers": layout.size, "joints": [layout.joint_names[j] for j in layout.joints]}
+        regressors["lstm"] = _network(
+            stage, training, clips["validation"], layout, space, linear, config, device, digest
+        )
+    note: dict[str, Any] = {
+        "mirrored": mirror is not None,
+        "control_numbers": layout.size,
+        "joints": [layout.joint_names[j] for j in layout.joints],
+    }
     for name, regressor in regressors.items():
         note[name] = {} if name == "lstm" else {"ridge": linear.ridge}
         for role, known in clips.items():
@@ -273,7 +286,8 @@ def _regressors(
 
 def _network(
     stage: Stage,
-    clips: Mapping[Role, Sequence[Clip]],
+    training: Sequence[Clip],
+    validation: Sequence[Clip],
     layout: ControlLayout,
     space: ShapeSpace,
     linear: LinearRegressor,
@@ -288,7 +302,7 @@ def _network(
     path = stage.path / LSTM
     if not path.is_file():
         found = train_lstm(
-            clips["training"], clips["validation"], layout, space.std, stage.path,
+            training, validation, layout, space.std, stage.path,
             lstm=config.lstm, config=config.training, linear=linear, device=device,
         )  # fmt: skip
         save_lstm(path, found, model_digest=digest)

@@ -35,6 +35,8 @@ __all__ = ["train_lstm"]
 
 _KIND = "capture4d training checkpoint"
 _CHECKPOINT = "last.safetensors"
+USUAL_EPOCHS, LEAST_STEPS = 30, 500
+"""Where the settings leave the number of epochs open."""
 
 
 @dataclass(slots=True)
@@ -81,8 +83,14 @@ def train_lstm(
         torch.manual_seed(config.seed)
         network = EncoderDecoder(inputs.shape[2], targets.shape[2], lstm).to(place)
         optimiser = torch.optim.Adam(
-            network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay, foreach=False
+            network.parameters(),
+            lr=config.learning_rate,
+            weight_decay=config.weight_decay,
+            decoupled_weight_decay=True,
+            foreach=False,
         )
+        count = max(1, math.ceil(len(inputs) / config.batch))
+        epochs = config.epochs or max(USUAL_EPOCHS, math.ceil(LEAST_STEPS / count))
         best = {name: each.clone() for name, each in network.state_dict().items()}
         progress = _Progress(records=[])
         checkpoint = folder / "checkpoints" / _CHECKPOINT
@@ -92,12 +100,16 @@ def train_lstm(
         assert progress.records is not None
         saved = time.monotonic()
 
-        while progress.epoch < config.epochs and progress.epoch - progress.best_epoch <= config.patience:
+        while progress.epoch < epochs and progress.epoch - progress.best_epoch <= config.patience:
             order = np.random.default_rng([config.seed, progress.epoch]).permutation(len(inputs))
-            batches = np.array_split(order, max(1, math.ceil(len(order) / config.batch)))
+            batches = np.array_split(order, count)
+            for group in optimiser.param_groups:
+                group["lr"] = config.learning_rate * (1 + math.cos(math.pi * progress.epoch / epochs)) / 2
             network.train()
             for batch in batches[progress.step :]:
                 controls, wanted, mask = (torch.from_numpy(each[batch]).to(place) for each in (inputs, targets, known))
+                if config.control_noise > 0:
+                    controls = controls + config.control_noise * torch.randn(controls.shape).to(place)
                 said = network(controls, wanted, config.teacher_forcing)
                 loss = (weight * (said - wanted) ** 2 * mask[..., None]).sum() / (mask.sum() * len(weight)).clamp(min=1)
                 optimiser.zero_grad()
@@ -144,7 +156,7 @@ def _windows(
     """All windows of the clips that end in a good frame: scales, controls (B, W, D), whitened coefficients (B, W, K),
     and which of those are known (B, W)."""
     full = [with_history(clip, layout.config.history, np.maximum(np.asarray(std, np.float32), 1e-6)) for clip in clips]
-    scales = Scales.of(np.concatenate([clip.controls[clip.good] for clip in full]).astype(np.float64), std)
+    scales = Scales.of(np.concatenate([clip.controls[clip.good] for clip in full]).astype(np.float64), std, layout)
     inputs, targets, known = [], [], []
     for clip, plain in zip(full, clips, strict=True):
         wanted = plain.coefficients if linear is None else plain.coefficients - linear.predict(plain.controls)

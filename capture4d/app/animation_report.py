@@ -160,6 +160,7 @@ def _page(
         charts=_charts(records),
         columns=2,
         calibration=None,
+        comparison=None,
         tracking=None,
         extraction=[],
         tracked=[],

@@ -85,7 +85,7 @@ def test_the_ridge_is_the_one_that_validates_best_and_bad_frames_do_not_count(cl
 
 
 def test_the_paper_s_network_has_as_many_numbers_as_counted() -> None:
-    network = EncoderDecoder(60, 500, LstmConfig())
+    network = EncoderDecoder(60, 500, LstmConfig(layers=4))
 
     def size(module: torch.nn.Module) -> int:
         return sum(each.numel() for each in module.parameters())
