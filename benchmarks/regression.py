@@ -62,7 +62,7 @@ def run(
             paper = replace(
                 config,
                 mirror="off",
-                lstm=replace(config.lstm, layers=2 if quick else 4),
+                lstm=replace(config.lstm, layers=2 if quick else 4, over_linear=False),
                 training=replace(config.training, weight_decay=0.0, control_noise=0.0),
             )
             wanted = ("lstm_to_linear_mse", "linear_vertex_mm", "lstm_vertex_mm")

@@ -70,13 +70,15 @@ def train_lstm(
     Args:
         validation: decide when to stop and which weights to keep; without any, the training clips do.
         folder: gets checkpoints/ and metrics.jsonl.
-        linear: predict what this regression leaves, instead of the whole.
+        linear: the regression whose remainder is predicted, where `lstm.over_linear` wants that.
     Raises:
         InputError: torch does not know the device, or the checkpoint is damaged.
     """
     validation = validation or training
     if not lstm.over_linear:
         linear = None
+    elif linear is None:
+        raise InputError("training: expected a linear regression, over which the LSTM is to learn, found none")
     scales, inputs, targets, known = _windows(training, layout, std, lstm, linear)
     place = _device(device)
     with _threads(config.threads):
