@@ -143,7 +143,8 @@ def test_the_network_learns_what_a_line_cannot(tmp_path: Path) -> None:
     linear = fit_linear(known[:3], known[3:], layout(), spread(known), LinearConfig())
     network = train_lstm(
         known[:3], known[3:], layout(), spread(known), tmp_path,
-        lstm=LstmConfig(layers=1, size=32, over_linear=False), config=TrainingConfig(epochs=30, batch=16, learning_rate=1e-2),
+        lstm=LstmConfig(layers=1, size=32, over_linear=False),
+        config=TrainingConfig(epochs=30, batch=16, learning_rate=1e-2),
     )  # fmt: skip
     backwards = Clip(known[3].controls[::-1].copy(), known[3].coefficients[::-1].copy(), known[3].good)
     for clip in (known[3], backwards):
@@ -208,8 +209,11 @@ rng = np.random.default_rng(0)
 layout = ControlLayout(("root", "a"), (1,), 60.0, ControlConfig())
 controls = rng.standard_normal((400, layout.size)).astype(np.float32)
 clip = Clip(controls, np.sin(controls[:, :3]), np.ones(400, bool))
-found = train_lstm([clip], [clip], layout, np.ones(3), pathlib.Path(sys.argv[1]), lstm=LstmConfig(layers=2, size=32, over_linear=False),
-                   config=TrainingConfig(epochs=12, batch=8, checkpoint_s=0.05))
+found = train_lstm(
+    [clip], [clip], layout, np.ones(3), pathlib.Path(sys.argv[1]),
+    lstm=LstmConfig(layers=2, size=32, over_linear=False),
+    config=TrainingConfig(epochs=12, batch=8, checkpoint_s=0.05),
+)
 save_lstm(pathlib.Path(sys.argv[1]) / "done.safetensors", found, model_digest="x")
 """
 
