@@ -310,7 +310,7 @@ def worst_errors(
 
     Args:
         rows: the frames to measure; `transforms` are those of all frames.
-        counts: numbers of directions, ascending.
+        counts: numbers of directions.
     """
     worst, total, seen_vertices = dict.fromkeys(counts, 0.0), dict.fromkeys(counts, 0.0), 0
     flat = space.basis.reshape(len(space.basis), -1)
@@ -319,7 +319,7 @@ def worst_errors(
         part, known = np.asarray(frames[kept], np.float64), np.asarray(weights[kept], np.float64)
         seen = known >= SEEN
         seen_vertices += int(seen.sum())
-        for count in counts:
+        for count in worst:
             space_k = space.first(count)
             coefficients = _coefficients(space_k, part - space.mean, known)
             residual = part - space.mean - (coefficients @ flat[:count]).reshape(part.shape)

@@ -46,7 +46,7 @@ def run_demo(output: Path, *, workers: int, overwrite: bool = False) -> tuple[Pa
     network = WRINKLES["small"]
     network = replace(network, held_out=HELD_OUT, schedule=replace(network.schedule, steps=WRINKLE_STEPS))
     train_wrinkles([output], output / "wrinkles" / "model", network, workers=workers, overwrite=overwrite)
-    small = CompareConfig(held_out=HELD_OUT, image_texels=128, epochs=10)
+    small = CompareConfig(held_out=HELD_OUT, image_texels=128, epochs=60)
     compare(output, output / "wrinkles" / "model", small, workers=workers, overwrite=overwrite)
     report = run_report(output, capture=output / "capture", workers=workers, overwrite=overwrite)
     animate(

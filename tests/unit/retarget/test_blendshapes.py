@@ -145,6 +145,14 @@ def test_skinning_many_frames_is_skinning_each() -> None:
     )
 
 
+def test_a_number_of_directions_asked_for_twice_is_measured_once() -> None:
+    frames, _ = low_rank()
+    space = learned(frames)
+    skin_weights, transforms = np.ones((frames.shape[1], 1), np.float32), np.tile(np.eye(4), (len(frames), 1, 1, 1))
+    known = (space, frames, np.ones(frames.shape[:2]), np.arange(len(frames)), transforms, skin_weights)
+    assert worst_errors(*known, [2, 5, 2]) == worst_errors(*known, [5, 2])
+
+
 def test_bad_numbers_are_one_line() -> None:
     frames, _ = low_rank()
     space = learned(frames)
