@@ -96,7 +96,7 @@ def run(
     workers: int = 1,
     overwrite: bool = False,
 ) -> Path:
-    """Learn the baselines, measure, draw; the path of the page.
+    """Learn the baselines, measure, draw, unless that has been done; the path of the page.
 
     Args:
         model: folder of `capture4d wrinkles train`.
@@ -114,6 +114,10 @@ def run(
     stage = open_stage(
         work / "compare", name="compare", schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite
     )
+    page_path = stage.path / "index.html"
+    if page_path.is_file():  # the last file of a run
+        stage.finish([page_path])
+        return page_path
     torch.set_num_threads(workers)
     capture, sequence = work_capture(work), load_registration(work / "registration")
     template = MapTemplate.create(sequence.garment, MapConfig(size=generator.map_size))
@@ -182,9 +186,9 @@ def run(
         name=capture.name, rows=table, frames=frames, count=len(held.frame_ids), against_truth=truth is not None,
         error_deg=ERROR_DEG, bar=colour_bar(ERROR_DEG), people=people, middle=middle,
     )  # fmt: skip
-    write_bytes(stage.path / "index.html", page.encode())
-    stage.finish([stage.path / "index.html"])
-    return stage.path / "index.html"
+    write_bytes(page_path, page.encode())
+    stage.finish([page_path])
+    return page_path
 
 
 def _people(modelled: Modelled, row: int) -> list[Panel]:

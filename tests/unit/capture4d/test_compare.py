@@ -79,3 +79,21 @@ def test_the_page_stands_alone_and_shows_all(compared: Path):
     assert page.count("<figure>") == 2 * (9 + 6) + 5
     for name in ("scan", "network", "offset images", "map of the scan"):
         assert f"<figcaption>{name}</figcaption>" in page
+
+
+def test_a_comparison_is_made_once(compared: Path):
+    before = (compared / "index.html").stat().st_mtime_ns
+    again = [
+        "compare",
+        compared.parent,
+        "--model",
+        compared.parents[1] / "model",
+        "--image-texels",
+        "32",
+        "--epochs",
+        "2",
+    ]
+    with pytest.raises(SystemExit) as exit_:
+        main([str(argument) for argument in (*again, "--workers", "1")])
+    assert not exit_.value.code
+    assert (compared / "index.html").stat().st_mtime_ns == before
