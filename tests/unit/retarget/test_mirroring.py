@@ -25,7 +25,11 @@ def sheet(shift: float = 0.0) -> Mesh:
 
 def some_poses(seed: int = 0, frames: int = 3) -> PoseSequence:
     rng = np.random.default_rng(seed)
-    turned = Rotation.random(frames * len(NAMES), random_state=rng).as_matrix().reshape(frames, len(NAMES), 3, 3)
+    turned = (
+        Rotation.from_rotvec(rng.standard_normal((frames * len(NAMES), 3)))
+        .as_matrix()
+        .reshape(frames, len(NAMES), 3, 3)
+    )
     places = rng.standard_normal((frames, 3)).astype(np.float32)
     ids = np.arange(frames, dtype=np.int32)
     return PoseSequence(turned.astype(np.float32), places, np.zeros(1, np.float32), ids, 60.0, NAMES)
