@@ -25,13 +25,12 @@ from capture4d.work_folder import load_moving_body, load_records, load_registrat
 from data_synth.cached_takes import cached_training_set
 from data_synth.config import TRAINING_SETS, TrainingSetConfig
 from registration.config import RegistrationConfig
+from retarget.config import ShapeConfig
 from retarget.learning import Take, UnposedTakes
 from retarget.pose_normalisation import PoseRows, unpose_sequence
 from retarget.splits import Piece, Role
 
 __all__ = ["Lesson", "learned_takes", "lesson", "registered_takes", "training_set", "true_places", "true_take"]
-
-UNSEEN_WEIGHT = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,7 +94,7 @@ def lesson(config: TrainingSetConfig, folder: Path, *, truth: bool, tracked: boo
     takes, frames, weights = [], [], []
     for name, (registered, shaped, poses, good) in zip(names, sequences, strict=True):
         rows = PoseRows.match(registered, shaped, poses)
-        for rest, weight in unpose_sequence(registered, rows, person, unseen_weight=UNSEEN_WEIGHT):
+        for rest, weight in unpose_sequence(registered, rows, person, unseen_weight=ShapeConfig().unseen_weight):
             frames.append(rest)
             weights.append(weight)
         transforms = np.stack([rows.transforms(row) for row in range(len(good))])

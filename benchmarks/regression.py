@@ -20,7 +20,7 @@ from benchmarks.learning_takes import Lesson, lesson, training_set
 from benchmarks.metric import Metric
 from retarget.config import FitConfig, LstmConfig, TrainingConfig
 from retarget.controls import ControlLayout, garment_joints
-from retarget.learning import learn_shapes, mirrored_clips, predictions, regression_clips, vertex_error_m
+from retarget.learning import learn_shapes, predictions, regression_clips, vertex_error_m
 from retarget.linear import LinearRegressor, fit_linear
 from retarget.mirroring import find_mirror
 from retarget.pose_range import nearest_poses, pose_quaternions
@@ -86,7 +86,9 @@ def _methods(taken: Lesson, config: FitConfig, seeds: int) -> list[Metric]:
     plain, validation = (regression_clips(takes, pieces, role, layout, space) for role in ("training", "validation"))
     rest = taken.garment.template.with_vertices(space.mean.astype(np.float32))
     mirror = find_mirror(rest, taken.person.body.joint_names, config.mirror)
-    training = plain if mirror is None else plain + mirrored_clips(takes, pieces, layout, space, mirror)
+    training = list(plain)
+    if mirror is not None:
+        training += regression_clips(takes, pieces, "training", layout, space, mirror)
     linear = fit_linear(training, validation, layout, space.std, config.linear)
     networks = [_network(training, validation, layout, space.std, linear, config, seed) for seed in range(seeds)]
     metrics = [Metric("directions", float(len(space.std))), Metric("control_numbers", float(layout.size))]

@@ -24,7 +24,6 @@ __all__ = [
     "Take",
     "UnposedTakes",
     "learn_shapes",
-    "mirrored_clips",
     "predictions",
     "regression_clips",
     "training_poses",
@@ -90,9 +89,18 @@ def learn_shapes(takes: UnposedTakes, pieces: Sequence[Piece], config: ShapeConf
 
 
 def regression_clips(
-    takes: UnposedTakes, pieces: Sequence[Piece], role: Role, layout: ControlLayout, space: ShapeSpace
+    takes: UnposedTakes,
+    pieces: Sequence[Piece],
+    role: Role,
+    layout: ControlLayout,
+    space: ShapeSpace,
+    mirror: Mirror | None = None,
 ) -> list[Clip]:
-    """Controls and coefficients of the pieces that have a role. Bad frames have no coefficients."""
+    """Controls and coefficients of the pieces that have a role. Bad frames have no coefficients.
+
+    Args:
+        mirror: the pieces are seen in it.
+    """
     clips = []
     for piece in pieces:
         if piece.role != role:
@@ -103,26 +111,10 @@ def regression_clips(
         rows = first + piece.frames.start + np.flatnonzero(good)
         coefficients = np.zeros((len(good), len(space.basis)), np.float32)
         if len(rows):
-            coefficients[good] = project(space, takes.vertices[rows], takes.weights[rows])
-        clips.append(Clip(control_vectors(layout, take.poses)[kept], coefficients, good))
-    return clips
-
-
-def mirrored_clips(
-    takes: UnposedTakes, pieces: Sequence[Piece], layout: ControlLayout, space: ShapeSpace, mirror: Mirror
-) -> list[Clip]:
-    """The training pieces, seen in a mirror."""
-    clips = []
-    for piece in pieces:
-        if piece.role != "training":
-            continue
-        take, kept = takes.takes[piece.take], slice(piece.frames.start, piece.frames.stop)
-        good = take.good[kept]
-        rows = takes.start(piece.take) + piece.frames.start + np.flatnonzero(good)
-        coefficients = np.zeros((len(good), len(space.basis)), np.float32)
-        if len(rows):
-            coefficients[good] = project(space, *mirror.frames(takes.vertices[rows], takes.weights[rows]))
-        clips.append(Clip(control_vectors(layout, mirror.poses(take.poses))[kept], coefficients, good))
+            frames = takes.vertices[rows], takes.weights[rows]
+            coefficients[good] = project(space, *(frames if mirror is None else mirror.frames(*frames)))
+        poses = take.poses if mirror is None else mirror.poses(take.poses)
+        clips.append(Clip(control_vectors(layout, poses)[kept], coefficients, good))
     return clips
 
 

@@ -39,7 +39,6 @@ from retarget.learning import (
     Take,
     UnposedTakes,
     learn_shapes,
-    mirrored_clips,
     predictions,
     regression_clips,
     training_poses,
@@ -259,7 +258,7 @@ def _regressors(
     clips: dict[Role, list[Clip]] = {role: regression_clips(takes, pieces, role, layout, space) for role in ROLES}
     training = list(clips["training"])
     if mirror is not None:
-        training += mirrored_clips(takes, pieces, layout, space, mirror)
+        training += regression_clips(takes, pieces, "training", layout, space, mirror)
     linear = fit_linear(training, clips["validation"], layout, space.std, config.linear)
     save_linear(stage.path / LINEAR, linear, model_digest=digest)
     regressors: dict[str, Regressor] = {"linear": linear}

@@ -17,7 +17,7 @@ from capture4d.app.charts import Line
 from capture4d.app.render import Drawn, render
 from capture4d.app.report import MAX_FLAGGED_ROWS, flat, is_current, joined_chart, shown, spread
 from capture4d.app.report_metrics import column
-from capture4d.app.report_pictures import CLOTH, VIEWS, Framing, Panel, data_uri
+from capture4d.app.report_pictures import CLOTH, SKIN, VIEWS, Framing, Panel, data_uri
 from capture4d.atomic_files import read_json, write_bytes, write_json
 from capture4d.body import pose_frame, with_shape
 from capture4d.types import Body, PoseSequence, RegisteredSequence
@@ -30,7 +30,6 @@ __all__ = ["ANIMATION_METRICS", "run"]
 SCHEMA = 1
 PICTURES = 8
 WIDTH, HEIGHT = 400, 370
-SKIN = (214, 190, 172)
 BLUE, ORANGE, GREEN, GREY = "#2f62c9", "#d9772b", "#2f8f5b", "#8d97a5"
 
 ANIMATION_METRICS: Mapping[str, tuple[str, str, str]] = {

@@ -27,7 +27,7 @@ import torch
 from capture4d.app.compare_config import CompareConfig
 from capture4d.app.compare_garment import Modelled, model_take
 from capture4d.app.render import Drawn, heat_colours, render
-from capture4d.app.report_pictures import CLOTH, HEIGHT, WIDTH, Framing, Panel, colour_bar, data_uri, write_panel
+from capture4d.app.report_pictures import CLOTH, HEIGHT, SKIN, WIDTH, Framing, Panel, colour_bar, data_uri, write_panel
 from capture4d.atomic_files import file_digest, read_json, write_bytes, write_json
 from capture4d.body_stage import load_tracking
 from capture4d.errors import InputError
@@ -59,7 +59,6 @@ SCHEMA = 2
 ERROR_DEG = 30.0
 """Normal error at which the strip's colours saturate."""
 MB = 1e6
-SKIN = (214, 190, 172)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

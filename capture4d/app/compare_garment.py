@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,21 +11,19 @@ import numpy as np
 from capture4d.body import pose_frame, with_shape
 from capture4d.errors import InputError
 from capture4d.types import Body, Mesh, PoseSequence, RegisteredSequence
+from data_synth.config import OTHER_BODIES
 from retarget.animation import Animator
 from retarget.blendshapes import project, reconstruct, shape_space, skin_frames
 from retarget.bodies import captured_person, retargeted_mean
-from retarget.config import AnimateConfig
+from retarget.config import AnimateConfig, ShapeConfig
 from retarget.controls import control_vectors
 from retarget.pose_normalisation import PoseRows, unpose_sequence
 from retarget.stage import GarmentModel
 
 __all__ = ["PEOPLE", "Dressed", "Modelled", "ModelledSurface", "model_take"]
 
-PEOPLE = {"as captured": None, "thin": (0.0, -2.0), "heavy": (0.0, 2.0), "tall": (1.5, 0.0), "short": (-1.5, 0.0)}
+PEOPLE: Mapping[str, tuple[float, ...] | None] = {"as captured": None, **OTHER_BODIES}
 """Whom the garment is shown on: first coefficients of their shape."""
-
-UNSEEN_WEIGHT = 0.05
-"""Of vertices without scan data when a frame is projected on the blendshapes, as in `capture4d fit`."""
 MB = 1e6
 
 
@@ -56,7 +54,6 @@ class Modelled:
     known: GarmentModel
     poses: PoseSequence
     """Of the take, in the order of its registered frames."""
-    rows: range
     surfaces: Sequence[ModelledSurface]
     coefficients: np.ndarray
     """(T, K) float32 of all frames, from the poses, by the LSTM if the model has one."""
@@ -102,7 +99,7 @@ def model_take(
     assert weights is not None
     person = captured_person(model, known.body)
     matched = PoseRows.match(sequence, with_shape(body, poses.shape), poses)
-    unposed = list(unpose_sequence(sequence, matched, person.shape, unseen_weight=UNSEEN_WEIGHT))
+    unposed = list(unpose_sequence(sequence, matched, person.shape, unseen_weight=ShapeConfig().unseen_weight))
     frames, seen = (np.stack([unposed[row][part] for row in rows]) for part in (0, 1))
     answers = {"blendshapes": (project(shape_space(model), frames, seen).astype(np.float32), 0.0, 0)}
     coefficients = np.zeros((0, 0), np.float32)
@@ -127,4 +124,4 @@ def model_take(
             vertices.append(placed[0])
         megabytes = (model.basis.nbytes + model.mean.nbytes + size) / MB
         surfaces.append(ModelledSurface(name, np.stack(vertices), float(np.median(times)) + extra_ms, megabytes))
-    return Modelled(known, matched.poses, rows, surfaces, coefficients)
+    return Modelled(known, matched.poses, surfaces, coefficients)

@@ -34,6 +34,7 @@ __all__ = [
 VIEWS: tuple[Direction, ...] = ("three_quarter", "back")
 WIDTH, HEIGHT = 400, 370
 CLOTH = (176, 190, 208)
+SKIN = (214, 190, 172)
 LOOP = (222, 140, 28)
 WEBP = "data:image/webp;base64,"
 NO_SCAN = "no scan"
