@@ -274,6 +274,9 @@ TRAINING_SETS: dict[str, TrainingSetConfig] = {
                 "hop": MotionConfig("hop"),
                 "sampled-1": MotionConfig("sampled", seed=1),
                 "sampled-2": MotionConfig("sampled", seed=2),
+                "sampled-4": MotionConfig("sampled", seed=4),
+                "sampled-5": MotionConfig("sampled", seed=5),
+                "sampled-6": MotionConfig("sampled", seed=6),
                 "reach-twist": MotionConfig("reach-twist"),
                 "sampled-3": MotionConfig("sampled", seed=3),
                 "twist-reversed": MotionConfig("twist", skip_frames=75, reverse=True),
@@ -300,8 +303,8 @@ TRAINING_SETS: dict[str, TrainingSetConfig] = {
         bodies=OTHER_BODIES,
     ),
 }
-"""Sets of takes by name. `tshirt-train` has 1,650 frames with scans and 1,200 without, which by the costs that
-`python -m benchmarks synthesis` prints is about 13,000 CPU seconds; `tiny-train` is its small likeness."""
+"""Sets of takes by name. `tshirt-train` has 2,100 frames with scans and 1,200 without, which by the costs that
+`python -m benchmarks synthesis` prints is about 16,000 CPU seconds; `tiny-train` is its small likeness."""
 
 
 @dataclass(frozen=True, slots=True)
