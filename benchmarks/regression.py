@@ -1,4 +1,4 @@
-"""From pose to folds: mean pose, nearest pose, linear regression and the network, on clips that were not learned from.
+"""From pose to folds: mean and nearest pose, linear regression, LSTM and kernels, on clips that were not learned from.
 
 DeepWrinkles (ECCV 2018) prints a mean squared error of 2.902 for its linear regression and 1.892 for its LSTM, a ratio
 of 0.65, on shapes of its own; ours are in square millimetres. Beside the defaults stands `paper_`: its network of four
@@ -20,13 +20,14 @@ from benchmarks.learning_takes import Lesson, lesson, training_set
 from benchmarks.metric import Metric
 from retarget.config import FitConfig, LstmConfig, TrainingConfig
 from retarget.controls import ControlLayout, garment_joints
-from retarget.learning import learn_shapes, predictions, regression_clips, vertex_error_m
+from retarget.kernel import fit_kernel
+from retarget.learning import fitting_clips, learn_shapes, predictions, regression_clips, vertex_error_m
 from retarget.linear import LinearRegressor, fit_linear
 from retarget.mirroring import find_mirror
 from retarget.pose_range import nearest_poses, pose_quaternions
-from retarget.regressors import Clip, Regressor
+from retarget.regressors import Clip, FittingClips, Regressor
 from retarget.splits import Piece
-from retarget.training import train_lstm
+from retarget.training import fit_lstm
 
 FREE_FRAMES = 1000
 DEFAULT = FitConfig()
@@ -62,7 +63,7 @@ def run(
             paper = replace(
                 config,
                 mirror="off",
-                lstm=replace(config.lstm, layers=2 if quick else 4, over_linear=False),
+                lstm=replace(config.lstm, layers=2 if quick else 4, over_linear=False, weighed=False),
                 training=replace(config.training, weight_decay=0.0, control_noise=0.0),
             )
             wanted = ("lstm_to_linear_mse", "linear_vertex_mm", "lstm_vertex_mm")
@@ -83,41 +84,42 @@ def _methods(taken: Lesson, config: FitConfig, seeds: int) -> list[Metric]:
         takes.takes[0].poses.fps,
         config.control,
     )
-    plain, validation = (regression_clips(takes, pieces, role, layout, space) for role in ("training", "validation"))
+    plain = regression_clips(takes, pieces, "training", layout, space)
+    plain += regression_clips(takes, pieces, "validation", layout, space)
     rest = taken.garment.template.with_vertices(space.mean.astype(np.float32))
-    mirror = find_mirror(rest, taken.person.body.joint_names, config.mirror)
-    training = list(plain)
-    if mirror is not None:
-        training += regression_clips(takes, pieces, "training", layout, space, mirror)
-    linear = fit_linear(training, validation, layout, space.std, config.linear)
-    networks = [_network(training, validation, layout, space.std, linear, config, seed) for seed in range(seeds)]
+    clips = fitting_clips(takes, pieces, layout, space, find_mirror(rest, taken.person.body.joint_names, config.mirror))
+    linear = fit_linear(clips, layout, space.std, config.linear)
+    kernel = fit_kernel(clips, layout, space.std, config.kernel)
+    networks = [_network(clips, layout, space.std, linear, config, seed) for seed in range(seeds)]
     metrics = [Metric("directions", float(len(space.std))), Metric("control_numbers", float(layout.size))]
     for name, examined in (("", pieces), ("reversed_", taken.reversed)):
-        clips = regression_clips(takes, examined, "held out", layout, space)
+        held_out = regression_clips(takes, examined, "held out", layout, space)
         said = {
-            "mean": [[np.zeros_like(clip.coefficients) for clip in clips]],
+            "mean": [[np.zeros_like(clip.coefficients) for clip in held_out]],
             "nearest": [_nearest(taken, examined, layout, plain)],
-            "linear": [predictions(linear, clips)],
-            "lstm": [predictions(network, clips) for network in networks],
+            "linear": [predictions(linear, held_out)],
+            "lstm": [predictions(network, held_out) for network in networks],
+            "kernel": [predictions(kernel, held_out)],
         }
         errors: dict[str, tuple[float, float]] = {}
         for method, tries in said.items():
-            mse = float(np.mean([_squared(answers, clips) for answers in tries]))
+            mse = float(np.mean([_squared(answers, held_out) for answers in tries]))
             off = float(np.mean([vertex_error_m(takes, examined, "held out", space, answers) for answers in tries]))
             errors[method] = mse, off
             metrics.append(Metric(f"{name}{method}_coefficient_mse_mm2", 1e6 * mse, "mm2"))
             metrics.append(Metric(f"{name}{method}_vertex_mm", 1e3 * off, "mm"))
-        metrics.append(Metric(f"{name}lstm_to_linear_mse", errors["lstm"][0] / errors["linear"][0]))
-        metrics.append(Metric(f"{name}lstm_to_linear_vertex", errors["lstm"][1] / errors["linear"][1]))
+        for method in ("lstm", "kernel"):
+            for kind, which in (("mse", 0), ("vertex", 1)):
+                ratio = errors[method][which] / errors["linear"][which]
+                metrics.append(Metric(f"{name}{method}_to_linear_{kind}", ratio))
         if not name:
-            drifts = [_drift(network, clips[0]) for network in networks]
+            drifts = [_drift(regressor, held_out[0]) for regressor in (*networks, kernel)]
             metrics.append(Metric(f"drift_{FREE_FRAMES}_frames", max(drifts)))
     return metrics
 
 
 def _network(
-    training: Sequence[Clip],
-    validation: Sequence[Clip],
+    clips: FittingClips,
     layout: ControlLayout,
     std: np.ndarray,
     linear: LinearRegressor,
@@ -126,10 +128,11 @@ def _network(
 ) -> Regressor:
     settings: TrainingConfig = replace(config.training, seed=seed)
     with tempfile.TemporaryDirectory(prefix="capture4d-regression-") as scratch:
-        found = train_lstm(
-            training, validation, layout, std, Path(scratch), lstm=config.lstm, config=settings, linear=linear
-        )
-        lines = (Path(scratch) / "metrics.jsonl").read_text().splitlines()
+        found = fit_lstm(
+            clips, layout, std, Path(scratch),
+            lstm=config.lstm, config=settings, linear=linear, linear_config=config.linear,
+        )  # fmt: skip
+        lines = (Path(scratch) / "training" / "metrics.jsonl").read_text().splitlines()
     Console(stderr=True).print(f"seed {seed}: {len(lines)} epochs, {lines[-1]}", soft_wrap=True)
     return found
 
@@ -143,7 +146,7 @@ def _nearest(
     def quaternions(piece: Piece) -> np.ndarray:
         return pose_quaternions(takes[piece.take].poses.rotations, layout.joints)
 
-    learned = [piece for piece in taken.pieces if piece.role == "training"]
+    learned = [piece for role in ("training", "validation") for piece in taken.pieces if piece.role == role]
     good = np.concatenate([clip.good for clip in training])
     known = np.concatenate([quaternions(piece) for piece in learned])[good]
     coefficients = np.concatenate([clip.coefficients for clip in training])[good]

@@ -30,7 +30,7 @@ def main() -> None:
 
     known = load_garment_model(options.model)
     model, person = known.model, captured_person(known.model, known.body)
-    regressor = known.linear if known.lstm is None else known.lstm
+    regressor = known.best
     controls, answers = ControlStream(regressor.layout), regressor.stream()
     poses = load_poses(options.poses)
     regressor.layout.require(poses)

@@ -72,19 +72,19 @@ def run(
     Raises:
         InputError: a file is damaged, the poses or the body are of another skeleton, or numbers are not finite.
     """
-    known = load_garment_model(model, device=device, with_lstm=config.regressor != "linear")
-    if config.regressor == "lstm" and known.lstm is None:
-        raise InputError(f"{known.folder}: expected an LSTM in the model, found a linear regression only")
+    known, name = _model(model, config, device)
     person = _person(known, body, beta)
     motion = _motion(known, poses, person)
     if (output / "body" / "stage.json").is_file():
         raise InputError(f"{output}: expected a folder for the animation alone, found a take with a tracked body")
     folder = output / "registration"
-    upstream = {"model": known.digest, "poses": file_digest([poses], root=poses.parent), "lstm": "none"}
+    upstream = {
+        "model": known.digest,
+        "poses": file_digest([poses], root=poses.parent),
+        "regressor": file_digest([known.folder / f"{name}.safetensors"], root=known.folder),
+    }
     if body is not None:
         upstream["body"] = file_digest([body], root=body.parent)
-    if known.lstm is not None:
-        upstream["lstm"] = file_digest([known.folder / "lstm.safetensors"], root=known.folder)
     settings = {**asdict(config), "beta": [float(value) for value in person.shape]}
     sources = {"model": known.folder, "poses": poses}
     stage = open_stage(
@@ -98,7 +98,7 @@ def run(
     template = garment.template.with_vertices(mean.astype(np.float32))
     save_garment(folder / "garment.npz", replace(garment, template=template, body_shape=motion.shape))
     if not (folder / "coefficients.npy").is_file():
-        regressor = known.linear if known.lstm is None else known.lstm
+        regressor = known.regressors[name]
         write_npy(folder / "coefficients.npy", regressor.predict(control_vectors(regressor.layout, motion)))
     distances = known.poses.distances(motion)
     unlike = max(config.unlike_deg, known.poses.validated_deg)
@@ -112,6 +112,18 @@ def run(
     for _ in run_jobs(job, jobs, workers=workers, label="animate", units=lambda each: len(each.rows)):
         pass
     return _collect(stage, frame_ids)
+
+
+def _model(path: Path, config: AnimateConfig, device: str) -> tuple[GarmentModel, str]:
+    """The model, and which of its regressors is meant; torch is loaded only for the LSTM."""
+    known = load_garment_model(path, device=device, with_lstm=config.regressor == "lstm")
+    if config.regressor == "auto" and known.kernel is None:
+        known = load_garment_model(path, device=device)
+    found = list(known.regressors)
+    name = found[-1] if config.regressor == "auto" else config.regressor
+    if name not in found:
+        raise InputError(f"{known.folder}: expected a regressor '{name}' in the model, found {', '.join(found)} only")
+    return known, name
 
 
 def _person(known: GarmentModel, body: Path | None, beta: Sequence[float] | None) -> ShapedBody:

@@ -67,8 +67,23 @@ class LinearConfig:
 
     fit: Literal["ridge", "moore-penrose"] = "ridge"
     """Least squares with an intercept, or F = L T^+ as the paper prints it, without."""
-    ridges: tuple[float, ...] = (0.0, 1e-4, 1e-3, 1e-2, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
-    """Penalties to choose from on the validation clips, relative to the mean variance of the controls."""
+    ridges: tuple[float, ...] = (1e-3, 1e-2, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
+    """Penalties to choose from on the validation clips, relative to the variance of a standardised control. Without any
+    (0), what the validation clips could not show goes wild in a motion that has it."""
+
+
+@dataclass(frozen=True)
+class KernelConfig:
+    """Kernel ridge regression from control vectors to coefficients."""
+
+    length: float = 3.0
+    """Square of the width of the kernel over everything, relative to the mean squared distance of two frames."""
+    side_length: float = 1.5
+    """The same of the kernels over the sides of the body."""
+    ridges: tuple[float, ...] = (0.015, 0.05, 0.15, 0.5, 1.5)
+    """Penalties to choose from on the validation clips; a frame's likeness to itself is 1."""
+    most_frames: int = 4000
+    """Learn from no more frames than so many, evenly spread: memory grows with their square, time with their cube."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +97,8 @@ class LstmConfig:
     """Frames in and frames out."""
     over_linear: bool = True
     """Learn what the linear regression leaves; off, as in the paper, the whole."""
+    weighed: bool = True
+    """Give controls the size of what the garment moves with them; off, one size to all of a kind."""
 
 
 @dataclass(frozen=True)
@@ -118,8 +135,8 @@ class FitConfig:
 
     licence: str = ""
     """A note on who may use the model, kept in its file."""
-    regressor: Literal["both", "linear"] = "both"
-    """Leave the LSTM out with `linear`."""
+    regressor: Literal["all", "kernel", "linear"] = "all"
+    """`kernel` leaves the LSTM out, `linear` the kernels as well."""
     mirror: Literal["auto", "on", "off"] = "auto"
     """Whether regressors learn from the takes seen in a mirror as well; `auto`: if skeleton and garment have two sides
     that are alike."""
@@ -127,6 +144,7 @@ class FitConfig:
     split: SplitConfig = field(default_factory=SplitConfig)
     control: ControlConfig = field(default_factory=ControlConfig)
     linear: LinearConfig = field(default_factory=LinearConfig)
+    kernel: KernelConfig = field(default_factory=KernelConfig)
     lstm: LstmConfig = field(default_factory=LstmConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)
 
@@ -152,8 +170,8 @@ class RemovalConfig:
 class AnimateConfig:
     """Putting a learned garment on a motion and a body."""
 
-    regressor: Literal["auto", "lstm", "linear"] = "auto"
-    """`auto`: the LSTM if the model has one."""
+    regressor: Literal["auto", "kernel", "lstm", "linear"] = "auto"
+    """`auto`: the kernels if the model has them, otherwise the LSTM, otherwise the linear regression."""
     mean: Literal["corrected", "printed", "captured"] = "corrected"
     """How the mean meets another body: moved by the difference of the two bodies (Eq. 5, corrected), by the new body's
     whole offset from the average person (as printed), or not at all."""

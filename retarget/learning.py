@@ -17,12 +17,13 @@ from retarget.config import ShapeConfig
 from retarget.controls import ControlLayout, control_vectors
 from retarget.mirroring import Mirror
 from retarget.pose_range import PoseRange, nearest_poses, pose_quaternions
-from retarget.regressors import Clip, Regressor
+from retarget.regressors import Clip, FittingClips, Regressor
 from retarget.splits import Piece, Role
 
 __all__ = [
     "Take",
     "UnposedTakes",
+    "fitting_clips",
     "learn_shapes",
     "predictions",
     "regression_clips",
@@ -116,6 +117,23 @@ def regression_clips(
         poses = take.poses if mirror is None else mirror.poses(take.poses)
         clips.append(Clip(control_vectors(layout, poses)[kept], coefficients, good))
     return clips
+
+
+def fitting_clips(
+    takes: UnposedTakes,
+    pieces: Sequence[Piece],
+    layout: ControlLayout,
+    space: ShapeSpace,
+    mirror: Mirror | None = None,
+) -> FittingClips:
+    """What regressors are fitted to: the training clips, as they are and in the mirror, and the validation clips; in
+    the end those in the mirror as well."""
+    training, validation = (regression_clips(takes, pieces, role, layout, space) for role in ("training", "validation"))
+    known, late = list(training), list(validation)
+    if mirror is not None:
+        known += regression_clips(takes, pieces, "training", layout, space, mirror)
+        late += regression_clips(takes, pieces, "validation", layout, space, mirror)
+    return FittingClips(known, validation, [*known, *late])
 
 
 def vertex_error_m(

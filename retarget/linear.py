@@ -16,9 +16,18 @@ from jaxtyping import Float, Float32
 from capture4d.errors import InputError
 from retarget.config import LinearConfig
 from retarget.controls import ControlLayout
-from retarget.regressors import Clip, History, Regressor, Scales, read_regressor, with_history, write_regressor
+from retarget.regressors import (
+    Clip,
+    FittingClips,
+    History,
+    Scales,
+    mean_squared_error,
+    read_regressor,
+    with_history,
+    write_regressor,
+)
 
-__all__ = ["LinearRegressor", "fit_linear", "load_linear", "mean_squared_error", "save_linear"]
+__all__ = ["LinearRegressor", "fit_linear", "load_linear", "save_linear"]
 
 _KIND = "capture4d linear regressor"
 
@@ -60,23 +69,34 @@ class LinearStream:
 
 
 def fit_linear(
-    training: Sequence[Clip],
-    validation: Sequence[Clip],
+    clips: FittingClips, layout: ControlLayout, std: Float[np.ndarray, " shapes"], config: LinearConfig
+) -> LinearRegressor:
+    """Least squares; the validation clips choose the ridge, running freely where there is a history, and then all clips
+    are learned from.
+
+    Args:
+        std: spread of the coefficients, with which the history is whitened.
+    Raises:
+        InputError: there are not two good frames.
+    """
+    if not clips.validation or config.fit == "moore-penrose" or len(config.ridges) == 1:
+        return _fit(clips.all, layout, std, config, config.ridges)[0]
+    candidates = _fit(clips.training, layout, std, config, config.ridges)
+    best = min(candidates, key=lambda candidate: mean_squared_error(candidate, clips.validation))
+    return _fit(clips.all, layout, std, config, (best.ridge,))[0]
+
+
+def _fit(
+    clips: Sequence[Clip],
     layout: ControlLayout,
     std: Float[np.ndarray, " shapes"],
     config: LinearConfig,
-) -> LinearRegressor:
-    """Least squares over the training clips.
-
-    Args:
-        validation: choose the ridge, running freely where there is a history.
-        std: spread of the coefficients, with which the history is whitened.
-    Raises:
-        InputError: no clip has two frames.
-    """
+    ridges: Sequence[float],
+) -> list[LinearRegressor]:
+    """One regressor for each ridge."""
     whole = np.asarray(std, np.float32)
     history = layout.config.history
-    known = [with_history(clip, history, np.maximum(whole, 1e-6)) for clip in training]
+    known = [with_history(clip, history, np.maximum(whole, 1e-6)) for clip in clips]
     controls = np.concatenate([clip.controls[clip.good] for clip in known]).astype(np.float64)
     wanted = np.concatenate([clip.coefficients[clip.good] for clip in known]).astype(np.float64)
     if len(controls) < 2:
@@ -85,14 +105,14 @@ def fit_linear(
     if config.fit == "moore-penrose":
         plain = Scales(np.zeros_like(scales.control_mean), np.ones_like(scales.control_std), scales.std)
         matrix = np.linalg.pinv(controls) @ wanted
-        return LinearRegressor(layout, plain, matrix.astype(np.float32), np.zeros(len(whole), np.float32), 0.0)
+        return [LinearRegressor(layout, plain, matrix.astype(np.float32), np.zeros(len(whole), np.float32), 0.0)]
     standard = scales.standardised(controls).astype(np.float64)
     centre, middle = standard.mean(axis=0), wanted.mean(axis=0)
     left, values, right = np.linalg.svd(standard - centre, full_matrices=False)
     scores = left.T @ (wanted - middle)
     kept = values > 1e-6 * values.max(initial=0.0)  # standardised in single precision
     candidates = []
-    for ridge in config.ridges:
+    for ridge in ridges:
         # The penalty is relative to the mean square of a standardised control, which is about the number of frames.
         shrunk = np.where(kept, values / np.where(kept, values**2 + ridge * len(standard), 1.0), 0.0)
         matrix = right.T @ (shrunk[:, None] * scores)
@@ -100,19 +120,7 @@ def fit_linear(
         candidates.append(
             LinearRegressor(layout, scales, matrix.astype(np.float32), intercept.astype(np.float32), ridge)
         )
-    if not validation or len(candidates) == 1:
-        return candidates[0]
-    return min(candidates, key=lambda candidate: mean_squared_error(candidate, validation))
-
-
-def mean_squared_error(regressor: Regressor, clips: Sequence[Clip]) -> float:
-    """Mean square of the coefficients' errors over good frames and coefficients, square metres; running freely."""
-    total = count = 0.0
-    for clip in clips:
-        errors = (regressor.predict(clip.controls) - clip.coefficients)[clip.good].astype(np.float64)
-        total += float((errors**2).sum())
-        count += errors.size
-    return total / max(count, 1.0)
+    return candidates
 
 
 def save_linear(path: Path, regressor: LinearRegressor, *, model_digest: str) -> None:

@@ -8,24 +8,42 @@ Letters: T frames, D controls (with the history), K coefficients.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Float64
 
 from capture4d.errors import InputError
 from capture4d.tensor_files import TensorFile, read_tensors, write_tensors
 from retarget.config import ControlConfig
 from retarget.controls import ControlLayout
 
-__all__ = ["Clip", "History", "Regressor", "Scales", "Stream", "read_regressor", "with_history", "write_regressor"]
+__all__ = [
+    "Clip",
+    "FittingClips",
+    "History",
+    "Regressor",
+    "Scales",
+    "Stream",
+    "mean_squared_error",
+    "read_regressor",
+    "usual_response",
+    "with_history",
+    "write_regressor",
+]
 
 
 LEAST_LIVELY = 0.2
 """Share of the largest standard deviation of a kind of controls by which each of them is divided at least."""
+
+
+RESPONSE_RIDGE = 0.3
+"""Penalty of the regression that says what a control counts, relative to the variance of a standardised control."""
+LEAST_RESPONSE = 0.02
+"""A control counts at least this share of the mean of all."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,6 +54,27 @@ class Clip:
     coefficients: Float32[np.ndarray, "frames shapes"]
     good: np.ndarray
     """(T,) bool: frames whose coefficients are known; the others only lead up to them."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FittingClips:
+    """What a regressor is fitted to. Settings are chosen by learning from some clips and looking at others; with the
+    chosen ones everything is learned from."""
+
+    training: Sequence[Clip]
+    validation: Sequence[Clip]
+    """Choose the settings; none: the first of each is taken."""
+    all: Sequence[Clip]
+    """To learn from in the end: the training clips, those that validated, and those seen in a mirror."""
+
+    @staticmethod
+    def create(training: Sequence[Clip], validation: Sequence[Clip] = ()) -> FittingClips:
+        return FittingClips(training, validation, [*training, *validation])
+
+    @property
+    def settled(self) -> FittingClips:
+        """The training clips alone, with nothing left to choose."""
+        return FittingClips(self.training, (), self.training)
 
 
 @runtime_checkable
@@ -95,8 +134,28 @@ class Scales:
     def standardised(self, controls: Float[np.ndarray, "*frames controls"]) -> Float32[np.ndarray, "*frames controls"]:
         return ((controls - self.control_mean) / self.control_std).astype(np.float32)
 
+    def weighed(self, response: Float[np.ndarray, "controls shapes"]) -> Scales:
+        """The same, with controls larger the farther the garment moves with them."""
+        lengths = np.linalg.norm(response, axis=1)
+        usual = max(float(lengths.mean()), 1e-30)
+        wide = np.maximum(lengths / usual, LEAST_RESPONSE)
+        return Scales(self.control_mean, (self.control_std / wide).astype(np.float32), self.std)
+
     def whitened(self, coefficients: Float[np.ndarray, "*frames shapes"]) -> Float32[np.ndarray, "*frames shapes"]:
         return (coefficients / self.std).astype(np.float32)
+
+
+def usual_response(
+    known: Float[np.ndarray, "frames controls"], coefficients: Float[np.ndarray, "frames shapes"]
+) -> Float64[np.ndarray, "controls shapes"]:
+    """How coefficients change with each standardised control, by a ridge regression: what a control counts.
+
+    The length of a row is how far the garment moves when that control alone goes by its standard deviation.
+    """
+    centred = known.astype(np.float64) - known.mean(axis=0, dtype=np.float64)
+    offsets = coefficients.astype(np.float64) - coefficients.mean(axis=0, dtype=np.float64)
+    penalty = RESPONSE_RIDGE * max(len(known), 1) * np.eye(known.shape[1])
+    return np.linalg.solve(centred.T @ centred + penalty, centred.T @ offsets)
 
 
 class History:
@@ -123,6 +182,16 @@ def with_history(clip: Clip, frames: int, std: Float32[np.ndarray, " shapes"]) -
     past = [np.concatenate([np.zeros_like(whitened[:step]), whitened[:-step]]) for step in range(1, frames + 1)]
     past = [each[: len(whitened)] for each in past]
     return Clip(np.concatenate([clip.controls, *past], axis=1), clip.coefficients, clip.good)
+
+
+def mean_squared_error(regressor: Regressor, clips: Sequence[Clip]) -> float:
+    """Mean square of the coefficients' errors over good frames and coefficients, square metres; running freely."""
+    total = count = 0.0
+    for clip in clips:
+        errors = (regressor.predict(clip.controls) - clip.coefficients)[clip.good].astype(np.float64)
+        total += float((errors**2).sum())
+        count += errors.size
+    return total / max(count, 1.0)
 
 
 # --- files -------------------------------------------------------------------------------------------------------

@@ -5,9 +5,10 @@ body.npz                   the body that moved the garment
 takes/NAME.json            verdicts of the frames that were unposed; done when it is there
 blendshapes.safetensors    the model, with template, weights, borders, licence
 linear.safetensors         regression from controls to coefficients
+kernel.safetensors         the same by kernels
 lstm.safetensors           the same by the network
 poses.safetensors          the poses it was learned from
-checkpoints/ metrics.jsonl of the training
+training/ final/           checkpoints and metrics of the network
 fit.json                   what was learned from, how many directions, and the errors
 """
 
@@ -35,26 +36,30 @@ from capture4d.workers import run_jobs
 from retarget.blendshapes import ShapeSpace, as_model_arrays, shape_space, worst_errors
 from retarget.config import FitConfig
 from retarget.controls import ControlLayout, garment_joints
+from retarget.kernel import KernelRegressor, fit_kernel, load_kernel, save_kernel
 from retarget.learning import (
     Take,
     UnposedTakes,
+    fitting_clips,
     learn_shapes,
     predictions,
     regression_clips,
     training_poses,
     vertex_error_m,
 )
-from retarget.linear import LinearRegressor, fit_linear, load_linear, mean_squared_error, save_linear
+from retarget.linear import LinearRegressor, fit_linear, load_linear, save_linear
 from retarget.mirroring import Mirror, find_mirror
 from retarget.pose_normalisation import PoseRows, unpose_sequence
 from retarget.pose_range import PoseRange, load_pose_range, save_pose_range
-from retarget.regressors import Clip, Regressor
+from retarget.regressors import Clip, FittingClips, Regressor, mean_squared_error
 from retarget.splits import ROLES, Piece, Role, split_takes
 
 __all__ = ["GarmentModel", "load_garment_model", "run"]
 
-SCHEMA = 2
-MODEL, LINEAR, LSTM, POSES = (f"{name}.safetensors" for name in ("blendshapes", "linear", "lstm", "poses"))
+SCHEMA = 3
+MODEL, LINEAR, KERNEL, LSTM, POSES = (
+    f"{name}.safetensors" for name in ("blendshapes", "linear", "kernel", "lstm", "poses")
+)
 
 
 def run(
@@ -113,7 +118,7 @@ def run(
 
 
 def _finish(stage: Stage) -> str:
-    files = [stage.path / name for name in ("body.npz", MODEL, LINEAR, LSTM, POSES)]
+    files = [stage.path / name for name in ("body.npz", MODEL, LINEAR, KERNEL, LSTM, POSES)]
     digest = stage.finish([path for path in files if path.is_file()])
     shutil.rmtree(stage.path / "unposed", ignore_errors=True)
     return digest
@@ -256,23 +261,23 @@ def _regressors(
     """Learn what is not there yet, and measure all of it."""
     digest = _digest(stage.path)
     clips: dict[Role, list[Clip]] = {role: regression_clips(takes, pieces, role, layout, space) for role in ROLES}
-    training = list(clips["training"])
-    if mirror is not None:
-        training += regression_clips(takes, pieces, "training", layout, space, mirror)
-    linear = fit_linear(training, clips["validation"], layout, space.std, config.linear)
+    lesson = fitting_clips(takes, pieces, layout, space, mirror)
+    linear = fit_linear(lesson, layout, space.std, config.linear)
     save_linear(stage.path / LINEAR, linear, model_digest=digest)
     regressors: dict[str, Regressor] = {"linear": linear}
-    if config.regressor == "both":
-        regressors["lstm"] = _network(
-            stage, training, clips["validation"], layout, space, linear, config, device, digest
-        )
+    if config.regressor != "linear":
+        kernel = fit_kernel(lesson, layout, space.std, config.kernel)
+        save_kernel(stage.path / KERNEL, kernel, model_digest=digest)
+        regressors["kernel"] = kernel
+    if config.regressor == "all":
+        regressors["lstm"] = _network(stage, lesson, layout, space, linear, config, device, digest)
     note: dict[str, Any] = {
         "mirrored": mirror is not None,
         "control_numbers": layout.size,
         "joints": [layout.joint_names[j] for j in layout.joints],
     }
     for name, regressor in regressors.items():
-        note[name] = {} if name == "lstm" else {"ridge": linear.ridge}
+        note[name] = {"ridge": regressor.ridge} if isinstance(regressor, (LinearRegressor, KernelRegressor)) else {}
         for role, known in clips.items():
             if known:
                 error = vertex_error_m(takes, pieces, role, space, predictions(regressor, known))
@@ -285,8 +290,7 @@ def _regressors(
 
 def _network(
     stage: Stage,
-    training: Sequence[Clip],
-    validation: Sequence[Clip],
+    lesson: FittingClips,
     layout: ControlLayout,
     space: ShapeSpace,
     linear: LinearRegressor,
@@ -296,13 +300,13 @@ def _network(
 ) -> Regressor:
     # torch takes a second to load
     from retarget.lstm import load_lstm, save_lstm
-    from retarget.training import train_lstm
+    from retarget.training import fit_lstm
 
     path = stage.path / LSTM
     if not path.is_file():
-        found = train_lstm(
-            training, validation, layout, space.std, stage.path,
-            lstm=config.lstm, config=config.training, linear=linear, device=device,
+        found = fit_lstm(
+            lesson, layout, space.std, stage.path,
+            lstm=config.lstm, config=config.training, linear=linear, linear_config=config.linear, device=device,
         )  # fmt: skip
         save_lstm(path, found, model_digest=digest)
     return load_lstm(path, model_digest=digest, linear=linear)
@@ -323,10 +327,21 @@ class GarmentModel:
     model: BlendshapeModel
     body: Body
     linear: LinearRegressor
+    kernel: KernelRegressor | None
     lstm: Regressor | None
     poses: PoseRange
     digest: str
     """Of the blendshapes' file."""
+
+    @property
+    def regressors(self) -> dict[str, Regressor]:
+        """Those that the model has, by name; the best last."""
+        found = {"linear": self.linear, "lstm": self.lstm, "kernel": self.kernel}
+        return {name: each for name, each in found.items() if each is not None}
+
+    @property
+    def best(self) -> Regressor:
+        return list(self.regressors.values())[-1]
 
 
 def load_garment_model(path: Path, *, device: str = "cpu", with_lstm: bool = True) -> GarmentModel:
@@ -347,10 +362,13 @@ def load_garment_model(path: Path, *, device: str = "cpu", with_lstm: bool = Tru
     linear = load_linear(folder / LINEAR, model_digest=digest)
     if len(linear.intercept) != len(model.std):
         raise InputError(f"{folder / LINEAR}: expected {len(model.std)} coefficients, found {len(linear.intercept)}")
+    kernel = None
+    if (folder / KERNEL).is_file():
+        kernel = load_kernel(folder / KERNEL, model_digest=digest)
     lstm = None
     if with_lstm and (folder / LSTM).is_file():
         from retarget.lstm import load_lstm
 
         lstm = load_lstm(folder / LSTM, model_digest=digest, linear=linear, device=device)
     known = load_pose_range(folder / POSES, model_digest=digest)
-    return GarmentModel(folder, model, load_body(folder / "body.npz"), linear, lstm, known, digest)
+    return GarmentModel(folder, model, load_body(folder / "body.npz"), linear, kernel, lstm, known, digest)

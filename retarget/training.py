@@ -13,7 +13,7 @@ import json
 import math
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,16 +25,17 @@ from torch import Tensor
 from capture4d.atomic_files import write_bytes
 from capture4d.errors import InputError
 from capture4d.tensor_files import read_tensors, write_tensors
-from retarget.config import LstmConfig, TrainingConfig
+from retarget.config import LinearConfig, LstmConfig, TrainingConfig
 from retarget.controls import ControlLayout
-from retarget.linear import LinearRegressor, mean_squared_error
+from retarget.linear import LinearRegressor, fit_linear
 from retarget.lstm import EncoderDecoder, LstmRegressor, frame_windows
-from retarget.regressors import Clip, Scales, with_history
+from retarget.regressors import Clip, FittingClips, Scales, mean_squared_error, usual_response, with_history
 
-__all__ = ["train_lstm"]
+__all__ = ["fit_lstm", "train_lstm"]
 
 _KIND = "capture4d training checkpoint"
 _CHECKPOINT = "last.safetensors"
+METRICS = "metrics.jsonl"
 USUAL_EPOCHS, LEAST_STEPS = 30, 500
 """Where the settings leave the number of epochs open."""
 
@@ -53,6 +54,49 @@ class _Progress:
     records: list[dict[str, Any]] | None = None
 
 
+def fit_lstm(
+    clips: FittingClips,
+    layout: ControlLayout,
+    std: Float[np.ndarray, " shapes"],
+    folder: Path,
+    *,
+    lstm: LstmConfig,
+    config: TrainingConfig,
+    linear: LinearRegressor,
+    linear_config: LinearConfig,
+    device: str = "cpu",
+) -> LstmRegressor:
+    """Train on some clips until those that validate get no better; then as long on all of them.
+
+    Args:
+        folder: gets training/ and final/, each with checkpoints and metrics.jsonl.
+        linear: the regression over which the network stands, if `lstm.over_linear`; fitted to all clips.
+        linear_config: how it was fitted, for its like on the training clips alone.
+    Raises:
+        InputError: torch does not know the device, or a checkpoint is damaged.
+    """
+    if not clips.validation:
+        return train_lstm(
+            clips.all, (), layout, std, folder / "final", lstm=lstm, config=config, linear=linear, device=device
+        )
+    alone = fit_linear(clips.settled, layout, std, replace(linear_config, ridges=(linear.ridge,)))
+    train_lstm(
+        clips.training, clips.validation, layout, std, folder / "training",
+        lstm=lstm, config=config, linear=alone, device=device,
+    )  # fmt: skip
+    records = (folder / "training" / METRICS).read_text().splitlines()
+    enough = json.loads(records[-1])["best_epoch"] + 1
+    epochs = config.epochs or _usual_epochs(sum(int(clip.good.sum()) for clip in clips.training), config)
+    return train_lstm(
+        clips.all, (), layout, std, folder / "final",
+        lstm=lstm, config=replace(config, epochs=epochs), linear=linear, device=device, stop_after=enough,
+    )  # fmt: skip
+
+
+def _usual_epochs(windows: int, config: TrainingConfig) -> int:
+    return max(USUAL_EPOCHS, math.ceil(LEAST_STEPS / max(1, math.ceil(windows / config.batch))))
+
+
 def train_lstm(
     training: Sequence[Clip],
     validation: Sequence[Clip],
@@ -64,6 +108,7 @@ def train_lstm(
     config: TrainingConfig,
     linear: LinearRegressor | None = None,
     device: str = "cpu",
+    stop_after: int | None = None,
 ) -> LstmRegressor:
     """Train until the validation clips get no better, going on from the checkpoint in `folder` if there is one.
 
@@ -71,6 +116,7 @@ def train_lstm(
         validation: decide when to stop and which weights to keep; without any, the training clips do.
         folder: gets checkpoints/ and metrics.jsonl.
         linear: the regression whose remainder is predicted, where `lstm.over_linear` wants that.
+        stop_after: epochs after which to stop and keep what there is, though the learning rate was to fall on.
     Raises:
         InputError: torch does not know the device, or the checkpoint is damaged.
     """
@@ -92,7 +138,8 @@ def train_lstm(
             foreach=False,
         )
         count = max(1, math.ceil(len(inputs) / config.batch))
-        epochs = config.epochs or max(USUAL_EPOCHS, math.ceil(LEAST_STEPS / count))
+        epochs = config.epochs or _usual_epochs(len(inputs), config)
+        last = epochs if stop_after is None else min(stop_after, epochs)
         best = {name: each.clone() for name, each in network.state_dict().items()}
         progress = _Progress(records=[])
         checkpoint = folder / "checkpoints" / _CHECKPOINT
@@ -102,7 +149,7 @@ def train_lstm(
         assert progress.records is not None
         saved = time.monotonic()
 
-        while progress.epoch < epochs and progress.epoch - progress.best_epoch <= config.patience:
+        while progress.epoch < last and progress.epoch - progress.best_epoch <= config.patience:
             order = np.random.default_rng([config.seed, progress.epoch]).permutation(len(inputs))
             batches = np.array_split(order, count)
             for group in optimiser.param_groups:
@@ -128,7 +175,7 @@ def train_lstm(
             error = mean_squared_error(LstmRegressor(layout, scales, lstm, network, linear), validation)
             if not math.isfinite(error):
                 raise InputError(f"training: the loss is no number after epoch {progress.epoch}; try a lower rate")
-            if error < progress.best:
+            if error < progress.best or stop_after is not None:
                 progress.best, progress.best_epoch = error, progress.epoch
                 best = {name: each.clone() for name, each in network.state_dict().items()}
             progress.records.append(
@@ -140,10 +187,10 @@ def train_lstm(
                 }
             )
             progress.epoch, progress.step, progress.loss_sum = progress.epoch + 1, 0, 0.0
-            _write_metrics(folder / "metrics.jsonl", progress.records)
+            _write_metrics(folder / METRICS, progress.records)
 
         _save(checkpoint, network, optimiser, best, progress)
-        _write_metrics(folder / "metrics.jsonl", progress.records)
+        _write_metrics(folder / METRICS, progress.records)
         network.load_state_dict(best)
         return LstmRegressor(layout, scales, lstm, network.eval(), linear)
 
@@ -158,7 +205,11 @@ def _windows(
     """All windows of the clips that end in a good frame: scales, controls (B, W, D), whitened coefficients (B, W, K),
     and which of those are known (B, W)."""
     full = [with_history(clip, layout.config.history, np.maximum(np.asarray(std, np.float32), 1e-6)) for clip in clips]
-    scales = Scales.of(np.concatenate([clip.controls[clip.good] for clip in full]).astype(np.float64), std, layout)
+    controls = np.concatenate([clip.controls[clip.good] for clip in full]).astype(np.float64)
+    scales = Scales.of(controls, std, layout)
+    if lstm.weighed:
+        coefficients = np.concatenate([clip.coefficients[clip.good] for clip in full])
+        scales = scales.weighed(usual_response(scales.standardised(controls), coefficients))
     inputs, targets, known = [], [], []
     for clip, plain in zip(full, clips, strict=True):
         wanted = plain.coefficients if linear is None else plain.coefficients - linear.predict(plain.controls)

@@ -24,6 +24,7 @@ __all__ = ["PEOPLE", "Dressed", "Modelled", "ModelledSurface", "model_take"]
 
 PEOPLE: Mapping[str, tuple[float, ...] | None] = {"as captured": None, **OTHER_BODIES}
 """Whom the garment is shown on: first coefficients of their shape."""
+_IN_WORDS = {"linear": "linear", "lstm": "LSTM", "kernel": "kernels"}
 MB = 1e6
 
 
@@ -56,7 +57,7 @@ class Modelled:
     """Of the take, in the order of its registered frames."""
     surfaces: Sequence[ModelledSurface]
     coefficients: np.ndarray
-    """(T, K) float32 of all frames, from the poses, by the LSTM if the model has one."""
+    """(T, K) float32 of all frames, from the poses, by the best regressor that the model has."""
 
     def on_people(self, row: int) -> list[Dressed]:
         """A frame of the take on other people, out of their bodies."""
@@ -103,15 +104,13 @@ def model_take(
     frames, seen = (np.stack([unposed[row][part] for row in rows]) for part in (0, 1))
     answers = {"blendshapes": (project(shape_space(model), frames, seen).astype(np.float32), 0.0, 0)}
     coefficients = np.zeros((0, 0), np.float32)
-    for name, regressor in (("linear", known.linear), ("LSTM", known.lstm)):
-        if regressor is None:
-            continue
+    for name, regressor in known.regressors.items():
         controls = control_vectors(regressor.layout, matched.poses)
         begin = time.perf_counter()
         coefficients = regressor.predict(controls)
         ms = 1e3 * (time.perf_counter() - begin) / len(controls)
-        size = (known.folder / f"{name.lower()}.safetensors").stat().st_size
-        answers[f"regression, {name}"] = coefficients[rows.start : rows.stop], ms, size
+        size = (known.folder / f"{name}.safetensors").stat().st_size
+        answers[f"regression, {_IN_WORDS[name]}"] = coefficients[rows.start : rows.stop], ms, size
     mean = retargeted_mean(model, person, matched.shaped).astype(np.float32)  # on the person as this take was tracked
     surfaces = []
     for name, (wanted, extra_ms, size) in answers.items():

@@ -1,4 +1,4 @@
-"""Linear regression and the network: exactness, parameter counts, streaming, drift, resuming."""
+"""Linear regression, kernels and the network: exactness, parameter counts, streaming, drift, resuming."""
 
 import json
 import os
@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,13 +16,15 @@ from scipy.spatial.transform import Rotation
 
 from capture4d.atomic_files import write_bytes
 from capture4d.errors import InputError
+from capture4d.tensor_files import read_tensors, write_tensors
 from capture4d.types import PoseSequence
-from retarget.config import ControlConfig, LinearConfig, LstmConfig, TrainingConfig
+from retarget.config import ControlConfig, KernelConfig, LinearConfig, LstmConfig, TrainingConfig
 from retarget.controls import ControlLayout, control_vectors
-from retarget.linear import fit_linear, load_linear, mean_squared_error, save_linear
+from retarget.kernel import fit_kernel, load_kernel, save_kernel
+from retarget.linear import fit_linear, load_linear, save_linear
 from retarget.lstm import EncoderDecoder, LstmRegressor, load_lstm, save_lstm
-from retarget.regressors import Clip
-from retarget.training import train_lstm
+from retarget.regressors import Clip, FittingClips, mean_squared_error
+from retarget.training import fit_lstm, train_lstm
 
 NAMES = ("root", "middle", "top")
 SMALL = LstmConfig(layers=2, size=24, over_linear=False)
@@ -58,10 +61,11 @@ def test_a_linear_garment_is_found_exactly() -> None:
     matrix, intercept = rng.standard_normal((chosen.size, 3)), rng.standard_normal(3)
     controls = rng.standard_normal((80, chosen.size)).astype(np.float32)
     clip = Clip(controls, (controls @ matrix + intercept).astype(np.float32), np.ones(80, bool))
-    found = fit_linear([clip], [clip], chosen, spread([clip]), LinearConfig())
-    assert found.ridge == 0.0
+    found = fit_linear(FittingClips([clip], [clip], [clip]), chosen, spread([clip]), LinearConfig(ridges=(0.0,)))
     np.testing.assert_allclose(found.predict(controls), clip.coefficients, atol=1e-4)
-    printed = fit_linear([clip], [clip], chosen, spread([clip]), LinearConfig(fit="moore-penrose"))
+    printed = fit_linear(
+        FittingClips([clip], [clip], [clip]), chosen, spread([clip]), LinearConfig(fit="moore-penrose")
+    )
     slow = clip.coefficients.T @ np.linalg.pinv(controls.T.astype(float))
     np.testing.assert_allclose(printed.predict(controls), controls @ slow.T, atol=1e-3)
     assert mean_squared_error(printed, [clip]) > 100 * mean_squared_error(found, [clip])  # it has no intercept
@@ -72,10 +76,11 @@ def test_the_ridge_is_the_one_that_validates_best_and_bad_frames_do_not_count(cl
     spoilt = Clip(known[0].controls, known[0].coefficients.copy(), known[0].good.copy())
     spoilt.coefficients[5], spoilt.good[5] = 1e3, False
     chosen, config = layout(), LinearConfig()
-    found = fit_linear([spoilt], known[2:], chosen, spread(known), config)
+    found = fit_linear(FittingClips([spoilt], known[2:], [spoilt]), chosen, spread(known), config)
     errors = {
         ridge: mean_squared_error(
-            fit_linear([spoilt], [], chosen, spread(known), LinearConfig(ridges=(ridge,))), known[2:]
+            fit_linear(FittingClips([spoilt], [], [spoilt]), chosen, spread(known), LinearConfig(ridges=(ridge,))),
+            known[2:],
         )
         for ridge in config.ridges
     }
@@ -94,12 +99,16 @@ def test_the_paper_s_network_has_as_many_numbers_as_counted() -> None:
 
 
 @pytest.mark.parametrize("history", [0, 2])
-@pytest.mark.parametrize("kind", ["linear", "lstm", "over linear"])
+@pytest.mark.parametrize("kind", ["linear", "kernel", "lstm", "over linear"])
 def test_streaming_equals_batch(clips, kind: str, history: int, tmp_path: Path) -> None:
     chosen = layout(history=history)
     known = clips(chosen=chosen)
-    found = linear = fit_linear(known[:3], known[3:], chosen, spread(known), LinearConfig(ridges=(0.1,)))
-    if kind != "linear":
+    found = linear = fit_linear(
+        FittingClips(known[:3], known[3:], known[:3]), chosen, spread(known), LinearConfig(ridges=(0.1,))
+    )
+    if kind == "kernel":
+        found = fit_kernel(FittingClips.create(known[:3], known[3:]), chosen, spread(known), KernelConfig())
+    elif kind != "linear":
         config = LstmConfig(layers=2, size=16, over_linear=kind == "over linear")
         training = TrainingConfig(epochs=2)
         found = train_lstm(
@@ -116,12 +125,13 @@ def test_running_freely_does_not_drift(clips, tmp_path: Path) -> None:
     for history in (0, 2):
         chosen = layout(history=history)
         known = clips(chosen=chosen)
-        linear = fit_linear(known[:3], known[3:], chosen, spread(known), LinearConfig())
+        linear = fit_linear(FittingClips(known[:3], known[3:], known[:3]), chosen, spread(known), LinearConfig())
         network = train_lstm(
             known[:3], known[3:], chosen, spread(known), tmp_path / str(history), lstm=SMALL, config=QUICK
         )
+        kernel = fit_kernel(FittingClips.create(known[:3], known[3:]), chosen, spread(known), KernelConfig())
         loop = np.tile(known[3].controls[:50], (20, 1))
-        for regressor in (linear, network):
+        for regressor in (linear, network, kernel):
             said = regressor.predict(loop).reshape(20, 50, -1)
             np.testing.assert_allclose(said[-1], said[2], atol=0.02 * np.abs(said).max())
 
@@ -140,7 +150,7 @@ def bending(frames: int, seed: int) -> Clip:
 
 def test_the_network_learns_what_a_line_cannot(tmp_path: Path) -> None:
     known = [bending(80, seed) for seed in range(4)]
-    linear = fit_linear(known[:3], known[3:], layout(), spread(known), LinearConfig())
+    linear = fit_linear(FittingClips(known[:3], known[3:], known[:3]), layout(), spread(known), LinearConfig())
     network = train_lstm(
         known[:3], known[3:], layout(), spread(known), tmp_path,
         lstm=LstmConfig(layers=1, size=32, over_linear=False),
@@ -149,6 +159,86 @@ def test_the_network_learns_what_a_line_cannot(tmp_path: Path) -> None:
     backwards = Clip(known[3].controls[::-1].copy(), known[3].coefficients[::-1].copy(), known[3].good)
     for clip in (known[3], backwards):
         assert mean_squared_error(network, [clip]) < 0.65 * mean_squared_error(linear, [clip])
+
+
+def test_kernels_learn_what_a_line_cannot() -> None:
+    known = [bending(80, seed) for seed in range(4)]
+    lesson = FittingClips(known[:3], known[3:], known[:3])
+    linear = fit_linear(lesson, layout(), spread(known), LinearConfig())
+    kernel = fit_kernel(lesson, layout(), spread(known), KernelConfig())
+    assert mean_squared_error(kernel, known[3:]) < 0.1 * mean_squared_error(linear, known[3:])
+
+
+SIDED = ("root", "spine", "arm.L", "arm.R")
+
+
+def lifted(left: np.ndarray, right: np.ndarray) -> Clip:
+    """Two arms and a spine; each arm's folds, bent as they are, are its own."""
+    frames = len(left)
+    rotations = np.tile(np.eye(3, dtype=np.float32), (frames, 4, 1, 1))
+    for joint, angle in ((1, 0.1 * left * right), (2, left), (3, right)):
+        rotations[:, joint] = Rotation.from_euler("z", angle[:, None]).as_matrix()
+    still, shape = np.zeros((frames, 3), np.float32), np.zeros(2, np.float32)
+    poses = PoseSequence(rotations, still, shape, np.arange(frames, dtype=np.int32), 60.0, SIDED)
+    wanted = np.stack([np.cos(3 * left), np.cos(3 * right)], axis=1).astype(np.float32)
+    chosen = ControlLayout(SIDED, (1, 2, 3), 60.0, ControlConfig(root_motion=False))
+    return Clip(control_vectors(chosen, poses), wanted, np.ones(frames, bool))
+
+
+def test_folds_of_one_arm_are_known_though_the_other_was_never_seen_there() -> None:
+    """One arm moves in each clip; then both do. Without sides in the joints' names, one kernel covers all rotations."""
+    sweep, still = np.linspace(-1, 1, 60), np.zeros(60)
+    lesson = FittingClips.create([lifted(sweep, still), lifted(still, sweep)])
+    both = [lifted(sweep, -sweep), lifted(sweep, sweep[::-1] * 0.7)]
+    chosen = ControlLayout(SIDED, (1, 2, 3), 60.0, ControlConfig(root_motion=False))
+    config = KernelConfig(ridges=(1e-3,))
+    sided = fit_kernel(lesson, chosen, np.ones(2), config)
+    blind = fit_kernel(lesson, replace(chosen, joint_names=("a", "b", "c", "d")), np.ones(2), config)
+    assert (len(sided.views), len(blind.views)) == (3, 2)  # the spine has not moved
+    assert mean_squared_error(sided, both) < 0.5 * mean_squared_error(blind, both)
+    assert mean_squared_error(sided, lesson.training) < 1e-3
+
+
+def test_kernels_choose_a_ridge_by_validation_then_learn_from_all_and_from_no_more_than_allowed(clips) -> None:
+    known, chosen = clips(frames=20), layout()
+    lesson = FittingClips.create(known[:2], known[2:3])
+    config = KernelConfig()
+    found = fit_kernel(lesson, chosen, spread(known), config)
+    errors = {
+        ridge: mean_squared_error(
+            fit_kernel(lesson.settled, chosen, spread(known), KernelConfig(ridges=(ridge,))), lesson.validation
+        )
+        for ridge in config.ridges
+    }
+    assert errors[found.ridge] == min(errors.values())
+    assert len(found.frames) == 60
+    few = fit_kernel(lesson, chosen, spread(known), KernelConfig(most_frames=25))
+    assert len(few.frames) == 25
+    assert np.isfinite(few.predict(known[3].controls)).all()
+    assert found.predict(known[3].controls[:0]).shape == (0, known[3].coefficients.shape[1])
+    bad = [replace(clip, good=np.zeros(20, bool)) for clip in known]
+    with pytest.raises(InputError, match="at least 2 good frames to learn from, found 0"):
+        fit_kernel(FittingClips.create(bad), chosen, spread(known), config)
+
+
+def test_the_network_ends_with_all_clips_for_as_long_as_it_took_to_validate(clips, tmp_path: Path) -> None:
+    known = clips(frames=20)
+    lesson = FittingClips.create(known[:2], known[2:])
+    linear = fit_linear(lesson, layout(), spread(known), LinearConfig())
+    config = TrainingConfig(epochs=8, batch=16, patience=3)
+
+    def go(name: str, clips: FittingClips) -> list[dict]:
+        fit_lstm(clips, layout(), spread(known), tmp_path / name, lstm=SMALL, config=config, linear=linear,
+                 linear_config=LinearConfig())  # fmt: skip
+        lines = (tmp_path / name / "final" / "metrics.jsonl").read_text().splitlines()
+        return [json.loads(line) for line in lines]
+
+    final = go("both", lesson)
+    first = (tmp_path / "both" / "training" / "metrics.jsonl").read_text().splitlines()
+    assert len(final) == json.loads(first[-1])["best_epoch"] + 1
+    assert final[-1]["best_epoch"] == len(final) - 1
+    go("alone", FittingClips.create(known))
+    assert not (tmp_path / "alone" / "training").exists()
 
 
 def test_training_stops_early_and_keeps_the_best(clips, tmp_path: Path) -> None:
@@ -202,7 +292,7 @@ TRAIN = """
 import sys, pathlib, numpy as np
 from retarget.config import *
 from retarget.controls import ControlLayout
-from retarget.regressors import Clip
+from retarget.regressors import Clip, FittingClips, mean_squared_error
 from retarget.training import train_lstm
 from retarget.lstm import save_lstm
 rng = np.random.default_rng(0)
@@ -246,13 +336,24 @@ def test_a_killed_run_ends_with_the_same_bits(tmp_path: Path) -> None:
 def test_files_come_back_as_they_were_and_wrong_ones_are_one_line(clips, tmp_path: Path) -> None:
     known, chosen = clips(count=2), layout(up=True)
     known = clips(count=2, chosen=chosen)
-    linear = fit_linear(known[:1], known[1:], chosen, spread(known), LinearConfig())
+    linear = fit_linear(FittingClips(known[:1], known[1:], known[:1]), chosen, spread(known), LinearConfig())
     config = LstmConfig(layers=1, size=8, over_linear=True)
     network = train_lstm(
         known[:1], known[1:], chosen, spread(known), tmp_path, lstm=config, config=QUICK, linear=linear
     )
     save_linear(tmp_path / "linear.safetensors", linear, model_digest="m")
     save_lstm(tmp_path / "lstm.safetensors", network, model_digest="m")
+    kernel = fit_kernel(FittingClips.create(known), chosen, spread(known), KernelConfig())
+    save_kernel(tmp_path / "kernel.safetensors", kernel, model_digest="m")
+    twin = load_kernel(tmp_path / "kernel.safetensors", model_digest="m")
+    assert (twin.layout, twin.ridge) == (chosen, kernel.ridge)
+    np.testing.assert_array_equal(twin.predict(known[1].controls), kernel.predict(known[1].controls))
+    file = read_tensors(tmp_path / "kernel.safetensors", "capture4d kernel regressor")
+    entries = {key: value for key, value in file.note.items() if key != "kind"}
+    tensors = {**file.tensors, "answers": file["answers"][:-1]}
+    write_tensors(tmp_path / "short.safetensors", "capture4d kernel regressor", tensors, entries)
+    with pytest.raises(InputError, match=r"short\.safetensors: expected learned frames of"):
+        load_kernel(tmp_path / "short.safetensors", model_digest="m")
     again = load_linear(tmp_path / "linear.safetensors", model_digest="m")
     assert again.layout == chosen
     np.testing.assert_array_equal(again.predict(known[1].controls), linear.predict(known[1].controls))

@@ -89,7 +89,8 @@ def test_fit_finds_the_waves_and_says_so(model: Path, works, make_world) -> None
         assert np.linalg.norm(waves @ direction) > 0.999
     assert note["linear"]["training"]["vertex_error_mm"] < 2.0
     assert note["lstm"]["validation"]["vertex_error_mm"] > 0
-    assert (model / "metrics.jsonl").read_text().count("\n") == 3
+    assert (model / "training" / "metrics.jsonl").read_text().count("\n") == 3
+    assert note["kernel"]["validation"]["vertex_error_mm"] > 0
     assert not (model / "unposed").exists()
 
 

@@ -1,0 +1,232 @@
+"""Regression by kernels: a frame's folds are put together from the learned frames whose poses are like its own.
+
+Ridge regression with a sum of Gaussian kernels. What "like" means is taken from a linear regression of the same frames,
+for a control counts by as much as it moves the garment:
+
+- over everything: two frames are alike if the linear regression puts the garment in the same place;
+- over each side of the body, and over its middle: two frames are alike if the joints there are turned alike, each
+  rotation weighted by how far the garment moves with it. A fold at one shoulder is learned without waiting for every
+  pose of the other.
+
+Letters: N learned frames, D controls, K coefficients, V views.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64
+from scipy.linalg import cho_factor, cho_solve
+
+from capture4d.errors import InputError
+from retarget.config import KernelConfig
+from retarget.controls import ControlLayout
+from retarget.mirroring import opposite_joints
+from retarget.regressors import (
+    Clip,
+    FittingClips,
+    Scales,
+    mean_squared_error,
+    read_regressor,
+    usual_response,
+    write_regressor,
+)
+
+__all__ = ["KernelRegressor", "fit_kernel", "load_kernel", "save_kernel"]
+
+_KIND = "capture4d kernel regressor"
+BATCH = 1024
+"""Frames that are answered together."""
+FROM_EVERYTHING = 0.5
+"""Weight of the kernel over everything; the sides share the rest."""
+
+
+@dataclass(frozen=True, eq=False)
+class KernelRegressor:
+    """Coefficients are a sum over the learned frames, each weighted by its likeness."""
+
+    layout: ControlLayout
+    scales: Scales
+    views: tuple[Float32[np.ndarray, "controls _"], ...]
+    """From standardised controls to what a kernel compares; frames a distance of 1 apart are alike by exp(-1/2)."""
+    shares: Float32[np.ndarray, " views"]
+    """Weights of the kernels, 1 in all."""
+    frames: Float32[np.ndarray, "learned controls"]
+    """Standardised controls of the learned frames."""
+    answers: Float32[np.ndarray, "learned shapes"]
+    """What each of them contributes."""
+    middle: Float32[np.ndarray, " shapes"]
+    ridge: float
+
+    def stream(self) -> KernelStream:
+        return KernelStream(self)
+
+    def predict(self, controls: Float32[np.ndarray, "frames controls"]) -> Float32[np.ndarray, "frames shapes"]:
+        known = self.scales.standardised(np.asarray(controls).reshape(-1, self.layout.size))
+        said = [np.zeros((0, len(self.middle)))]
+        said += [self.answer(known[start : start + BATCH]) for start in range(0, len(known), BATCH)]
+        return np.concatenate(said).astype(np.float32)
+
+    def answer(self, known: Float32[np.ndarray, "frames controls"]) -> Float64[np.ndarray, "frames shapes"]:
+        """Coefficients of frames, given by standardised controls."""
+        likeness = _likeness(_seen(known, self.views), self._learned, self.shares)
+        return likeness @ self.answers + self.middle
+
+    @cached_property
+    def _learned(self) -> list[Float64[np.ndarray, "learned _"]]:
+        return _seen(self.frames, self.views)
+
+
+class KernelStream:
+    """A motion that is answered frame by frame; nothing is carried from one to the next."""
+
+    def __init__(self, regressor: KernelRegressor) -> None:
+        self._regressor = regressor
+
+    def push(self, controls: Float[np.ndarray, " controls"]) -> Float32[np.ndarray, " shapes"]:
+        return self._regressor.predict(np.asarray(controls)[None])[0]
+
+
+def fit_kernel(
+    clips: FittingClips, layout: ControlLayout, std: Float[np.ndarray, " shapes"], config: KernelConfig
+) -> KernelRegressor:
+    """Kernel ridge regression; the validation clips choose the ridge, and then all clips are learned from.
+
+    Args:
+        std: spread of the coefficients.
+    Raises:
+        InputError: there are not two good frames.
+    """
+    if not clips.validation or len(config.ridges) == 1:
+        return _fit(clips.all, layout, std, config, config.ridges)[0]
+    candidates = _fit(clips.training, layout, std, config, config.ridges)
+    best = min(candidates, key=lambda candidate: mean_squared_error(candidate, clips.validation))
+    return _fit(clips.all, layout, std, config, (best.ridge,))[0]
+
+
+def _fit(
+    clips: Sequence[Clip],
+    layout: ControlLayout,
+    std: Float[np.ndarray, " shapes"],
+    config: KernelConfig,
+    ridges: Sequence[float],
+) -> list[KernelRegressor]:
+    """One regressor for each ridge."""
+    controls = np.concatenate([clip.controls[clip.good] for clip in clips]).astype(np.float64)
+    wanted = np.concatenate([clip.coefficients[clip.good] for clip in clips]).astype(np.float64)
+    if len(controls) < 2:
+        raise InputError(f"takes: expected at least 2 good frames to learn from, found {len(controls)}")
+    scales = Scales.of(controls, np.asarray(std, np.float32), layout)
+    known, middle = scales.standardised(controls), wanted.mean(axis=0)
+    views = _views(known, wanted, layout, config)
+    if len(known) > config.most_frames:
+        kept = np.linspace(0, len(known) - 1, config.most_frames).round().astype(int)
+        known, wanted = known[kept], wanted[kept]
+    sides = len(views) - 1
+    shares = np.array([FROM_EVERYTHING, *[(1 - FROM_EVERYTHING) / sides] * sides]) if sides else np.ones(1)
+    seen = _seen(known, views)
+    likeness = _likeness(seen, seen, shares)
+    found = []
+    for ridge in ridges:
+        factor = cho_factor(likeness + ridge * np.eye(len(likeness)), check_finite=False)
+        answers = cho_solve(factor, wanted - middle, check_finite=False)
+        found.append(
+            KernelRegressor(
+                layout, scales, views, shares.astype(np.float32), known,
+                answers.astype(np.float32), middle.astype(np.float32), ridge,
+            )
+        )  # fmt: skip
+    return found
+
+
+def _views(
+    known: Float32[np.ndarray, "frames controls"],
+    wanted: Float64[np.ndarray, "frames shapes"],
+    layout: ControlLayout,
+    config: KernelConfig,
+) -> tuple[Float32[np.ndarray, "controls _"], ...]:
+    """What the kernels compare: the linear regression's answers, and the rotations of each side by what they count."""
+    response = usual_response(known, wanted)
+    relevance = np.linalg.norm(response, axis=1)
+    views = [response / np.sqrt(config.length * _usual_square(known @ response))]
+    square = config.side_length * _usual_square(known * relevance)
+    for side in _sides(layout):
+        share = float((relevance[side] ** 2).sum() / max((relevance**2).sum(), 1e-30))
+        if share > 1e-6:
+            features = np.flatnonzero(side)
+            view = np.zeros((known.shape[1], len(features)))
+            view[features, np.arange(len(features))] = relevance[features] / np.sqrt(square * share)
+            views.append(view)
+    return tuple(view.astype(np.float32) for view in views)
+
+
+def _usual_square(features: Float64[np.ndarray, "frames features"]) -> float:
+    """Mean squared distance of two frames; positive."""
+    return max(2 * float(features.var(axis=0).sum()), 1e-30)
+
+
+def _sides(layout: ControlLayout) -> list[np.ndarray]:
+    """(D,) bool each: the rotations of joints in the middle, on one side, on the other; or all, of a skeleton whose
+    names tell no sides."""
+    try:
+        opposite = opposite_joints(layout.joint_names)
+    except InputError:
+        opposite = np.arange(len(layout.joint_names))
+    joints = np.array(layout.joints, int)
+    sides = (opposite[joints] == joints, opposite[joints] > joints, opposite[joints] < joints)
+    others = np.zeros(layout.size - 6 * len(joints), bool)
+    return [np.concatenate([np.repeat(side, 6), others]) for side in sides if side.any()]
+
+
+def _seen(
+    known: Float32[np.ndarray, "frames controls"], views: Sequence[Float32[np.ndarray, "controls _"]]
+) -> list[Float64[np.ndarray, "frames _"]]:
+    return [known.astype(np.float64) @ view.astype(np.float64) for view in views]
+
+
+def _likeness(
+    ours: Sequence[Float64[np.ndarray, "frames _"]],
+    theirs: Sequence[Float64[np.ndarray, "others _"]],
+    shares: Float[np.ndarray, " views"],
+) -> Float64[np.ndarray, "frames others"]:
+    total = np.zeros((len(ours[0]), len(theirs[0])))
+    for one, other, share in zip(ours, theirs, shares, strict=True):
+        squares = (one**2).sum(axis=1)[:, None] + (other**2).sum(axis=1) - 2 * one @ other.T
+        total += float(share) * np.exp(-0.5 * np.maximum(squares, 0))
+    return total
+
+
+def save_kernel(path: Path, regressor: KernelRegressor, *, model_digest: str) -> None:
+    write_regressor(
+        path,
+        _KIND,
+        {
+            **{f"views.{number}": view for number, view in enumerate(regressor.views)},
+            "shares": regressor.shares,
+            "frames": regressor.frames,
+            "answers": regressor.answers,
+            "middle": regressor.middle,
+        },
+        layout=regressor.layout,
+        scales=regressor.scales,
+        model_digest=model_digest,
+        note={"ridge": regressor.ridge},
+    )
+
+
+def load_kernel(path: Path, *, model_digest: str) -> KernelRegressor:
+    """Raises InputError: the file is damaged, another kind, or belongs to another model."""
+    file, layout, scales = read_regressor(path, _KIND, model_digest=model_digest)
+    shares, frames, answers, middle = (file[name] for name in ("shares", "frames", "answers", "middle"))
+    views = tuple(file[f"views.{number}"] for number in range(len(shares)))
+    wanted = (len(frames), layout.size), (len(frames), len(middle))
+    found = frames.shape, answers.shape
+    if wanted != found or any(len(view) != layout.size for view in views):
+        raise InputError(
+            f"{path}: expected learned frames of {wanted[0]} and {wanted[1]}, found {found[0]}, {found[1]}"
+        )
+    return KernelRegressor(layout, scales, views, shares, frames, answers, middle, float(file.entry("ridge")))
