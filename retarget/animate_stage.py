@@ -8,6 +8,7 @@ registration/  stage.json, garment.npz, frames/000123.npz, metrics/000123.json, 
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -57,6 +58,7 @@ def run(
     *,
     body: Path | None = None,
     beta: Sequence[float] | None = None,
+    coefficients: Float32[np.ndarray, "frames shapes"] | None = None,
     device: str = "cpu",
     workers: int = 1,
     overwrite: bool = False,
@@ -69,6 +71,7 @@ def run(
         output: work folder; gets body/ and registration/.
         body: another person's body.npz, made of the same faces and joints.
         beta: shape coefficients of the person; the captured person without `body` and `beta`.
+        coefficients: of the motion's frames, instead of a regressor's: a take's own projections, or edited ones.
     Raises:
         InputError: a file is damaged, the poses or the body are of another skeleton, or numbers are not finite.
     """
@@ -83,6 +86,11 @@ def run(
         "poses": file_digest([poses], root=poses.parent),
         "regressor": file_digest([known.folder / f"{name}.safetensors"], root=known.folder),
     }
+    if coefficients is not None:
+        expected = (len(motion.frame_ids), len(known.model.std))
+        if coefficients.shape != expected or not np.isfinite(coefficients).all():
+            raise InputError(f"coefficients: expected finite ones of {expected}, found {coefficients.shape}")
+        upstream["regressor"] = hashlib.sha256(coefficients.tobytes()).hexdigest()
     if body is not None:
         upstream["body"] = file_digest([body], root=body.parent)
     settings = {**asdict(config), "beta": [float(value) for value in person.shape]}
@@ -98,8 +106,10 @@ def run(
     template = garment.template.with_vertices(mean.astype(np.float32))
     save_garment(folder / "garment.npz", replace(garment, template=template, body_shape=motion.shape))
     if not (folder / "coefficients.npy").is_file():
-        regressor = known.regressors[name]
-        write_npy(folder / "coefficients.npy", regressor.predict(control_vectors(regressor.layout, motion)))
+        if coefficients is None:
+            regressor = known.regressors[name]
+            coefficients = regressor.predict(control_vectors(regressor.layout, motion))
+        write_npy(folder / "coefficients.npy", coefficients)
     distances = known.poses.distances(motion)
     unlike = max(config.unlike_deg, known.poses.validated_deg)
     frame_ids = [int(frame_id) for frame_id in motion.frame_ids]

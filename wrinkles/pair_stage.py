@@ -1,8 +1,11 @@
 """The stage that makes pairs of normal maps: a registered WORK in, WORK/wrinkles/pairs out.
 
+A garment that was animated has no scans. If it moves as a take did, its low maps pair with that take's high ones: what
+a network sees that is to work on the model's answers.
+
 stage.json            what was made
 template.npz          the garment, its UVs as the maps have them
-low/000123.png        normals of the registered template, garment coordinates, 16 bit; alpha: the texel shows something
+low/000123.png        normals of the template, garment coordinates, 16 bit; alpha: the texel shows something
 high/000123.png       normals of the scan; alpha: they are known
 metrics/000123.json   share of the texels that are known, and the angle between the two
 """
@@ -16,14 +19,15 @@ from pathlib import Path
 import numpy as np
 
 from capture4d.atomic_files import read_json, write_bytes, write_json
+from capture4d.errors import InputError
 from capture4d.garment_stage import load_garment_scan
-from capture4d.records import save_garment
+from capture4d.records import load_garment, save_garment
 from capture4d.types import Mesh, RegisteredSequence
 from capture4d.work_folder import failed_frames, load_registration, registered_digest, work_capture
 from capture4d.workdir import Stage, open_stage, require_complete
 from capture4d.workers import run_jobs
 from wrinkles.config import PairConfig
-from wrinkles.map_spaces import encode_png
+from wrinkles.map_spaces import decode_png, encode_png
 from wrinkles.normal_maps import FramePair, MapTemplate, frame_pairs
 
 __all__ = ["ensure_pairs", "run"]
@@ -41,12 +45,19 @@ class _Run:
     positions: range
 
 
-def run(work: Path, config: PairConfig, *, workers: int = 1, overwrite: bool = False) -> str:
+def run(
+    work: Path, config: PairConfig, *, high_from: Path | None = None, workers: int = 1, overwrite: bool = False
+) -> str:
     """Make the pair of every frame that has none yet; the digest of the result.
 
+    Args:
+        high_from: a work folder with finished pairs of the same frames, whose high maps are taken.
     Raises:
-        InputError: the work folder lacks its registration or its scans' garments, or the template has no usable UVs.
+        InputError: the work folder lacks its registration or its scans' garments, the template has no usable UVs, or
+            the pairs to borrow from are of another template or other frames.
     """
+    if high_from is not None:
+        return _borrow(work, high_from, config, overwrite=overwrite)
     upstream = {
         "registration": registered_digest(work),
         "garment": require_complete(work / "garment", "extract", f"capture4d extract CAPTURE --output {work}"),
@@ -73,6 +84,48 @@ def run(work: Path, config: PairConfig, *, workers: int = 1, overwrite: bool = F
         pass
     _template.cache_clear()
     maps = [stage.frame_path(frame_id, ".png", folder=folder) for folder in ("low", "high") for frame_id in frame_ids]
+    return stage.finish([output / "template.npz", *maps])
+
+
+def _borrow(work: Path, lender: Path, config: PairConfig, *, overwrite: bool) -> str:
+    """Pairs of this sequence's low maps with another's high maps; the frames that both have."""
+    pairs = lender / "wrinkles" / "pairs"
+    upstream = {
+        "registration": registered_digest(work),
+        "pairs": require_complete(pairs, "pairs", f"capture4d wrinkles maps {lender}"),
+    }
+    sequence, theirs = load_registration(work / "registration"), load_registration(lender / "registration")
+    template = MapTemplate.create(sequence.garment, config.map)
+    lent = load_garment(pairs / "template.npz").template
+    if not np.array_equal(lent.faces, template.mesh.faces) or not np.allclose(lent.uv, template.mesh.uv, atol=1e-5):
+        raise InputError(f"{lender}: expected maps of the template and layout of {work}, found others")
+    rows = {int(frame_id): row for row, frame_id in enumerate(theirs.frame_ids)}
+    shared = [(row, int(frame_id)) for row, frame_id in enumerate(sequence.frame_ids) if int(frame_id) in rows]
+    if not shared:
+        raise InputError(f"{lender}: expected frames of {work}, found none of its {len(sequence.frame_ids)}")
+    output = work / "wrinkles" / "pairs"
+    sources = {"pairs": pairs}
+    stage = open_stage(
+        output, name="pairs", schema=SCHEMA, config=config, upstream=upstream, sources=sources, overwrite=overwrite
+    )
+    if not (output / "template.npz").is_file():
+        save_garment(output / "template.npz", replace(sequence.garment, template=template.mesh))
+    pending = set(stage.pending([frame_id for _, frame_id in shared], ".png", folder="high"))
+    shown = template.raster.image(np.ones(len(template.raster.inside), bool))
+    for row, frame_id in shared:
+        if frame_id not in pending:
+            continue
+        vertices = np.array(sequence.vertices[row])
+        ours = template.rotation(vertices)
+        turn = (template.rotation(np.array(theirs.vertices[rows[frame_id]])).T @ ours).astype(np.float32)
+        path = pairs / "high" / f"{frame_id:06d}.png"
+        high, known = decode_png(path.read_bytes(), source=str(path))
+        if high.shape[0] != template.raster.size:
+            raise InputError(f"{path}: expected a map of {template.raster.size} texels, found {high.shape[0]}")
+        low = template.raster.image(template.low_normals(vertices) @ ours.astype(np.float32))
+        write_bytes(stage.frame_path(frame_id, ".png", folder="low"), encode_png(low, shown))
+        write_bytes(stage.frame_path(frame_id, ".png", folder="high"), encode_png(high @ turn, known))
+    maps = [stage.frame_path(frame_id, ".png", folder=folder) for folder in ("low", "high") for _, frame_id in shared]
     return stage.finish([output / "template.npz", *maps])
 
 

@@ -18,16 +18,22 @@ __all__ = ["Compare", "WrinklesApply", "WrinklesMaps", "WrinklesTrain"]
 
 @dataclass(frozen=True, kw_only=True)
 class WrinklesMaps(StageOptions):
-    """Make normal maps of a registered take: low ones from the template, high ones from its scans."""
+    """Make normal maps of a registered take: low ones from the template, high ones from its scans.
+
+    The model's answers to a take pair with its high maps: `capture4d animate MODEL --poses TAKE/body/poses.npz --output
+    WORK`, then `capture4d wrinkles maps WORK --high-from TAKE`.
+    """
 
     work: Annotated[Positional[Path], arg(metavar="WORK")]
     """Work folder; holds garment/ and registration/, gets wrinkles/pairs/."""
+    high_from: Path | None = None
+    """Work folder of the same frames, with finished maps, whose high ones are taken."""
     config: Annotated[PairConfig, arg(name="")] = field(default_factory=PairConfig)
 
     def __call__(self) -> int:
         from wrinkles.pair_stage import run
 
-        run(self.work, self.config, workers=self.workers, overwrite=self.overwrite)
+        run(self.work, self.config, high_from=self.high_from, workers=self.workers, overwrite=self.overwrite)
         print(f"maps: {self.work / 'wrinkles' / 'pairs'}")
         return 0
 

@@ -12,11 +12,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from capture4d.app.cli import main
-from capture4d.atomic_files import write_bytes
+from capture4d.atomic_files import write_bytes, write_npy, write_npz
 from capture4d.records import load_garment, save_garment
 from capture4d.types import Garment, Mesh
+from capture4d.workdir import open_stage
 from tests.unit.wrinkles.conftest import make_work, some_garment, some_scan, wrinkle_normals
 from wrinkles import train_stage
 from wrinkles.config import MapConfig
@@ -106,6 +108,49 @@ def test_maps_lost_are_made_again_alike(work: Path):
     path.unlink()
     assert run(*arguments) == 0
     assert path.read_bytes() == before
+
+
+TURN = Rotation.from_euler("xyz", [5, 20, 10], degrees=True).as_matrix()
+
+
+def turned_copy(work: Path, folder: Path, frame_ids: list[int]) -> Path:
+    """The garment as a bad model has it, turned, in some of the frames; no scans: as an animation is."""
+    garment = load_garment(work / "registration" / "garment.npz")
+    vertices = (garment.template.vertices @ TURN.T + [0, 0.01, 0]).astype(np.float32)
+    placed = open_stage(folder / "registration", name="animate", schema=1, config=None, upstream={})
+    save_garment(placed.path / "garment.npz", garment)
+    for frame_id in frame_ids:
+        write_npz(placed.frame_path(frame_id), vertices=vertices, residual_m=np.full(len(vertices), np.nan, np.float32))
+    write_npy(placed.path / "vertices.npy", np.tile(vertices, (len(frame_ids), 1, 1)))
+    placed.finish([placed.path / "vertices.npy"])
+    return folder
+
+
+def test_an_animation_borrows_the_high_maps_of_the_take_it_follows(
+    work: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """The low map is its own; the high one says the same in the world as that of the take."""
+    size = ("--map.size", "64", "--workers", "1")
+    animated = turned_copy(work, tmp_path / "animated", [2, 3, 9])
+    arguments = ("wrinkles", "maps", animated, "--high-from", work, *size)
+    assert "not finished" in fails(capsys, *arguments) or "run: capture4d wrinkles maps" in fails(capsys, *arguments)
+    assert run("wrinkles", "maps", work, *size) == 0
+    assert run(*arguments) == 0
+    theirs, ours = work / "wrinkles" / "pairs", animated / "wrinkles" / "pairs"
+    assert [path.name for path in sorted((ours / "high").iterdir())] == ["000002.png", "000003.png"]
+    for folder, turn in (("low", np.eye(3)), ("high", TURN.T)):  # the take's template has not moved
+        found, wanted = (
+            decode_png((pairs / folder / "000003.png").read_bytes(), source="") for pairs in (ours, theirs)
+        )
+        np.testing.assert_array_equal(found[1], wanted[1])
+        np.testing.assert_allclose(found[0][found[1]] @ turn, wanted[0][found[1]], atol=2e-4)
+    (ours / "high" / "000003.png").unlink()
+    assert run(*arguments) == 0  # only what is missing
+    other = turned_copy(work, tmp_path / "other", [20, 21])
+    assert "expected frames of" in fails(capsys, "wrinkles", "maps", other, "--high-from", work, *size)
+    larger = turned_copy(work, tmp_path / "larger", [2])
+    said = fails(capsys, "wrinkles", "maps", larger, "--high-from", work, "--map.size", "128")
+    assert "expected a map of 128 texels, found 64" in said
 
 
 # --- training and use
