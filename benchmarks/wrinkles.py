@@ -62,7 +62,7 @@ from wrinkles.pairs import fitted
 from wrinkles.train_stage import run as train_network
 from wrinkles.train_stage import score_take
 
-PRINTED: dict[TemporalLoss, tuple[float, float]] = {
+PRINTED: dict[str, tuple[float, float]] = {
     "l1": (4.63, 5.11),
     "l2": (5.16, 4.2),
     "printed": (3.72, 4.2),
@@ -159,7 +159,7 @@ def run(
         cells = {kind: cell(kind, clips, LossConfig(temporal_kind=kind)) for kind in get_args(TemporalLoss)}
         answers = _answers(clips, folder, bases, validation_share, workers)
         inputs = {name: cell(name, shown, LossConfig(temporal_kind="printed")) for name, shown in answers.items()}
-    _print_cells(cells, PRINTED)
+    _print_cells({**cells}, PRINTED)
     _print_cells({"registration": cells["printed"], **inputs}, {"registration": PRINTED["printed"], **PRINTED_INPUTS})
     made = [result.made for result in results]
     return [

@@ -29,6 +29,7 @@ from capture4d.workers import run_jobs
 from wrinkles.config import PairConfig
 from wrinkles.map_spaces import decode_png, encode_png
 from wrinkles.normal_maps import FramePair, MapTemplate, frame_pairs
+from wrinkles.pair_files import layout_digest
 
 __all__ = ["ensure_pairs", "run"]
 
@@ -97,7 +98,7 @@ def _borrow(work: Path, lender: Path, config: PairConfig, *, overwrite: bool) ->
     sequence, theirs = load_registration(work / "registration"), load_registration(lender / "registration")
     template = MapTemplate.create(sequence.garment, config.map)
     lent = load_garment(pairs / "template.npz").template
-    if not np.array_equal(lent.faces, template.mesh.faces) or not np.allclose(lent.uv, template.mesh.uv, atol=1e-5):
+    if layout_digest(lent, config.map.size) != layout_digest(template.mesh, config.map.size):
         raise InputError(f"{lender}: expected maps of the template and layout of {work}, found others")
     rows = {int(frame_id): row for row, frame_id in enumerate(theirs.frame_ids)}
     shared = [(row, int(frame_id)) for row, frame_id in enumerate(sequence.frame_ids) if int(frame_id) in rows]
