@@ -43,14 +43,14 @@ class ProjectionConfig:
     angle_deg: float = 45.0
     """Nor does one that faces another way by more than this."""
     border_rings: int = 1
-    """Rings of scan vertices along open borders, beyond the border itself, that are not trusted; 0 trusts all."""
+    """Rings of scan vertices along open borders that are not trusted: 1 is the border itself, 0 trusts all."""
     smoothing_passes: int = 1
     """Steps of half-way averaging of the scan's normals with their neighbours'."""
     temporal_frames: int = 3
     """Frames averaged in tangent space, an odd number."""
     temporal_span_s: float = 0.02
     """Neighbours farther apart in time are left out: the cloth itself has moved."""
-    blur_texels: float = 0.5
+    blur_texels: float = 0.4
     """Standard deviation of the blur, texels of a map of 256."""
 
 

@@ -122,7 +122,7 @@ def _scan_surface(scan: Mesh, config: ProjectionConfig) -> tuple[np.ndarray, np.
     for _ in range(config.smoothing_passes):
         normals = laplacian_pass(normals, scan.faces, none)
     outer = open_vertices(scan.faces, len(scan.vertices))[0]
-    for _ in range(config.border_rings):
+    for _ in range(config.border_rings - 1):
         ring = outer.copy()
         ring[scan.faces[outer[scan.faces].any(axis=1)]] = True
         outer = ring
