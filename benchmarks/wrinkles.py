@@ -304,7 +304,7 @@ def _milliseconds(config: WrinkleConfig, repeats: int, threads: int) -> float:
     times = []
     for _ in range(repeats + 1):
         begin = time.perf_counter()
-        model.generate(low, half_precision=config.schedule.half_precision)
+        model.generate(low)
         times.append(1e3 * (time.perf_counter() - begin))
     torch.set_num_threads(before)
     return float(np.median(times[1:]))

@@ -62,6 +62,11 @@ class UNet(nn.Module):
         self.apply(_initialise)
 
     def forward(self, low: Image) -> Image:
+        painted = self.paint(low)
+        return low + painted if self.output == "residual" else painted
+
+    def paint(self, low: Image) -> Image:
+        """What the last layer says: the map, or what to add to the low one."""
         passed = [low]
         for layer in self.down:
             passed.append(layer(passed[-1]))
@@ -71,7 +76,7 @@ class UNet(nn.Module):
             beside = passed.pop()
             if passed:
                 image = torch.cat([beside, image], dim=1)
-        return low + image if self.output == "residual" else image
+        return image
 
 
 class PatchDiscriminator(nn.Module):

@@ -1,9 +1,12 @@
 """Sizes as printed: parameters, receptive field, outputs."""
 
+from typing import Literal
+
 import pytest
 import torch
 
 from wrinkles.config import PRESETS, NetworkConfig
+from wrinkles.inference import WrinkleModel
 from wrinkles.networks import PatchDiscriminator, UNet, receptive_field, set_test_statistics
 
 PAPER = NetworkConfig()
@@ -73,3 +76,18 @@ def test_instance_statistics_leave_no_trace_and_running_ones_do_not_look_at_the_
     assert not torch.allclose(network(one), together[:1])
     for name, value in before.items():
         torch.testing.assert_close(network.state_dict()[name], value)
+
+
+@pytest.mark.parametrize("output", ["residual", "absolute"])
+def test_half_precision_changes_a_map_by_less_than_half_a_degree(output: Literal["residual", "absolute"]):
+    torch.manual_seed(0)
+    config = NetworkConfig(filters=32, layers=4, output=output, dropout=0.0)
+    model = WrinkleModel(UNet(config), config, texels=32, map_size=32, layout_digest="")
+    low = torch.nn.functional.normalize(torch.randn(3, 32, 32), dim=0)
+    low[:, :5] = 0
+    full, half = (model.generate(low, half_precision=each) for each in (False, True))
+    assert torch.equal(model.generate(low), half)  # 32 filters and more, by default
+    angle = torch.rad2deg(2 * torch.asin(((full - half).norm(dim=0) / 2).clamp(max=1)))[5:]
+    assert 0 < angle.mean() < 0.5
+    assert not half[:, :5].any()
+    assert model.generator.down[0][0].weight.dtype == torch.float32
