@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Float16, Int
 from torch import Tensor, nn
 
 from capture4d.body import pose_frame, with_shape
@@ -155,6 +155,14 @@ def vertex_errors_cm(made: Float[Tensor, "frames V 3"], truth: Float[Tensor, "fr
     return float((made - truth).norm(dim=-1).mean())
 
 
+def _drawn(layout: OffsetLayout, frames: OffsetFrames) -> Float16[Tensor, "frames 6 size size"]:
+    """The images of all frames, drawn once; half precision errs by 0.01 mm at 2 cm."""
+    images = torch.empty((len(frames), 6, *layout.mask.shape[:2]), dtype=torch.float16)
+    for image, offsets in zip(images, frames.offsets.numpy(), strict=True):
+        image.copy_(torch.from_numpy(layout.draw(offsets)).permute(2, 0, 1))
+    return images
+
+
 def train_offsets(
     network: nn.Module, layout: OffsetLayout, train: OffsetFrames, validation: OffsetFrames, config: OffsetConfig
 ) -> list[float]:
@@ -166,6 +174,7 @@ def train_offsets(
     torch.manual_seed(config.seed)
     sampler, faces = OffsetSampler(layout), torch.from_numpy(layout.garment.template.faces).long()
     mask = torch.from_numpy(layout.mask).permute(2, 0, 1)
+    drawn = _drawn(layout, train) if isinstance(network, ImageDecoder) else None
     optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate)
     best, weights, errors = float("inf"), {}, []
     for _ in range(config.epochs):
@@ -175,9 +184,8 @@ def train_offsets(
                 continue  # batch norm needs two
             part = train.rows(rows)
             made = network(part.pose)
-            if isinstance(network, ImageDecoder):
-                images = torch.from_numpy(np.stack([layout.draw(each) for each in part.offsets.numpy()]))
-                loss = grid_loss(made, images.permute(0, 3, 1, 2), mask, config.norm)
+            if drawn is not None:
+                loss = grid_loss(made, drawn[rows].float(), mask, config.norm)
                 if config.normal_weight > 0:
                     placed = sampler.positions(sampler(made), part.points, part.axes)
                     loss = loss + config.normal_weight * normal_loss(placed, part.vertices, faces)
