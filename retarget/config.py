@@ -57,6 +57,10 @@ class ControlConfig:
     """The direction of gravity in the root's frame as well."""
     joint_velocity: bool = False
     """Angular velocities of the garment's joints and of the root as well."""
+    whole_rotations: bool = False
+    """How the garment's joints are turned against the root, all joints between taken together, as well."""
+    lags: tuple[int, ...] = ()
+    """How far the rotations have come in so many frames as well: cloth that slid up an arm is slow to come down."""
     history: int = 0
     """Coefficients of so many frames before, as predicted (the autoregressive variant)."""
 
@@ -76,11 +80,15 @@ class LinearConfig:
 class KernelConfig:
     """Kernel ridge regression from control vectors to coefficients."""
 
+    control: ControlConfig = field(
+        default_factory=lambda: ControlConfig(whole_rotations=True, lags=(6, 18))  # 0.1 and 0.3 s at 60 fps
+    )
+    """Its own control vector, more than the paper's."""
     length: float = 3.0
     """Square of the width of the kernel over everything, relative to the mean squared distance of two frames."""
     side_length: float = 1.5
     """The same of the kernels over the sides of the body."""
-    ridges: tuple[float, ...] = (0.015, 0.05, 0.15, 0.5, 1.5)
+    ridges: tuple[float, ...] = (0.05, 0.15, 0.5)
     """Penalties to choose from on the validation clips; a frame's likeness to itself is 1."""
     most_frames: int = 4000
     """Learn from no more frames than so many, evenly spread: memory grows with their square, time with their cube."""

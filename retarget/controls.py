@@ -18,7 +18,7 @@ from jaxtyping import Float, Float32, Float64, Int32
 from scipy.spatial.transform import Rotation
 
 from capture4d.errors import InputError
-from capture4d.types import PoseSequence
+from capture4d.types import Body, PoseSequence
 from retarget.config import ControlConfig
 
 __all__ = ["ControlLayout", "ControlStream", "control_vectors", "garment_joints"]
@@ -54,6 +54,21 @@ class ControlLayout:
     """The garment's."""
     fps: float
     config: ControlConfig
+    parents: tuple[int, ...] = ()
+    """Of the whole skeleton, the root's -1; needed for whole rotations only."""
+
+    @staticmethod
+    def create(
+        body: Body, skin_weights: Float[np.ndarray, "verts joints"], fps: float, config: ControlConfig
+    ) -> ControlLayout:
+        """The layout of a garment's controls."""
+        joints = garment_joints(skin_weights, body.parents, config.joint_share)
+        return ControlLayout(body.joint_names, joints, fps, config, tuple(int(parent) for parent in body.parents))
+
+    @property
+    def rotation_sets(self) -> int:
+        """How often the rotations of the garment's joints stand at the head of a control vector: 6 numbers a joint."""
+        return 1 + self.config.whole_rotations
 
     @property
     def size(self) -> int:
@@ -62,14 +77,15 @@ class ControlLayout:
 
     @property
     def kinds(self) -> tuple[int, ...]:
-        """How many numbers there are of each unit: rotations, velocity, acceleration, gravity, turning."""
-        config = self.config
+        """How many numbers there are of each unit: rotations, velocity, acceleration, gravity, turning, lags."""
+        config, rotations = self.config, 6 * len(self.joints)
         counts = (
-            6 * len(self.joints),
+            *[rotations] * self.rotation_sets,
             3 * config.root_motion,
             3 * config.root_motion,
             3 * config.up,
             3 * (len(self.joints) + 1) * config.joint_velocity,
+            *[rotations * self.rotation_sets] * len(config.lags),
         )
         return tuple(count for count in counts if count)
 
@@ -88,12 +104,13 @@ class ControlLayout:
 
 
 class ControlStream:
-    """Control vectors of frames as they come."""
+    """Control vectors of frames as they come. Lags count frames; before the first, the first."""
 
     def __init__(self, layout: ControlLayout) -> None:
         self._layout = layout
         self._past: deque[tuple[float, np.ndarray]] = deque(maxlen=layout.config.derivative_frames)
         self._before: tuple[float, np.ndarray] | None = None
+        self._turned: deque[np.ndarray] = deque(maxlen=max(layout.config.lags, default=0) + 1)
 
     def push(
         self, rotations: Float[np.ndarray, "joints 3 3"], translation: Float[np.ndarray, " 3"], time_s: float
@@ -106,7 +123,11 @@ class ControlStream:
         config, joints = self._layout.config, list(self._layout.joints)
         local = rotations.astype(np.float64)
         self._past.append((time_s, translation.astype(np.float64)))
-        parts = [(local[joints] - np.eye(3))[:, :, :2].reshape(-1)]
+        turned = [local[joints]]
+        if config.whole_rotations:
+            turned.append(self._whole(local)[joints])
+        parts = [(np.concatenate(turned) - np.eye(3))[:, :, :2].reshape(-1)]
+        self._turned.append(parts[0])
         if config.root_motion:
             velocity, acceleration = _derivatives(self._past)
             parts += [local[0].T @ velocity, local[0].T @ acceleration]
@@ -114,7 +135,15 @@ class ControlStream:
             parts.append(local[0].T @ np.array([0.0, 1.0, 0.0]))
         if config.joint_velocity:
             parts.append(self._turning(local[[0, *joints]], time_s))
+        parts += [parts[0] - self._turned[max(len(self._turned) - 1 - lag, 0)] for lag in config.lags]
         return np.concatenate(parts)
+
+    def _whole(self, local: np.ndarray) -> np.ndarray:
+        """Rotations against the root, (J, 3, 3); only those of the garment's joints are right."""
+        whole = np.tile(np.eye(3), (len(local), 1, 1))
+        for joint in self._layout.joints:  # parents come first, and all but the root are among them
+            whole[joint] = whole[self._layout.parents[joint]] @ local[joint]
+        return whole
 
     def _turning(self, local: np.ndarray, time_s: float) -> np.ndarray:
         """Angular velocities since the frame before, radians a second, in each joint's own frame."""

@@ -178,8 +178,8 @@ def _sides(layout: ControlLayout) -> list[np.ndarray]:
         opposite = np.arange(len(layout.joint_names))
     joints = np.array(layout.joints, int)
     sides = (opposite[joints] == joints, opposite[joints] > joints, opposite[joints] < joints)
-    others = np.zeros(layout.size - 6 * len(joints), bool)
-    return [np.concatenate([np.repeat(side, 6), others]) for side in sides if side.any()]
+    others = np.zeros(layout.size - 6 * len(joints) * layout.rotation_sets, bool)
+    return [np.concatenate([*[np.repeat(side, 6)] * layout.rotation_sets, others]) for side in sides if side.any()]
 
 
 def _seen(

@@ -21,6 +21,7 @@ from retarget.regressors import Clip, FittingClips, Regressor
 from retarget.splits import Piece, Role
 
 __all__ = [
+    "Projected",
     "Take",
     "UnposedTakes",
     "fitting_clips",
@@ -89,6 +90,10 @@ def learn_shapes(takes: UnposedTakes, pieces: Sequence[Piece], config: ShapeConf
     return (space if fewest is None else space.first(fewest)), fewest
 
 
+Projected = dict[tuple[Piece, bool], np.ndarray]
+"""Coefficients of pieces, as they are (True) or in the mirror."""
+
+
 def regression_clips(
     takes: UnposedTakes,
     pieces: Sequence[Piece],
@@ -96,12 +101,15 @@ def regression_clips(
     layout: ControlLayout,
     space: ShapeSpace,
     mirror: Mirror | None = None,
+    projected: Projected | None = None,
 ) -> list[Clip]:
     """Controls and coefficients of the pieces that have a role. Bad frames have no coefficients.
 
     Args:
         mirror: the pieces are seen in it.
+        projected: coefficients that are known from another layout's clips; gets those that are not.
     """
+    projected = {} if projected is None else projected
     clips = []
     for piece in pieces:
         if piece.role != role:
@@ -109,13 +117,15 @@ def regression_clips(
         take, kept = takes.takes[piece.take], slice(piece.frames.start, piece.frames.stop)
         first = takes.start(piece.take)
         good = take.good[kept]
-        rows = first + piece.frames.start + np.flatnonzero(good)
-        coefficients = np.zeros((len(good), len(space.basis)), np.float32)
-        if len(rows):
-            frames = takes.vertices[rows], takes.weights[rows]
-            coefficients[good] = project(space, *(frames if mirror is None else mirror.frames(*frames)))
+        if (piece, mirror is None) not in projected:
+            rows = first + piece.frames.start + np.flatnonzero(good)
+            coefficients = np.zeros((len(good), len(space.basis)), np.float32)
+            if len(rows):
+                frames = takes.vertices[rows], takes.weights[rows]
+                coefficients[good] = project(space, *(frames if mirror is None else mirror.frames(*frames)))
+            projected[piece, mirror is None] = coefficients
         poses = take.poses if mirror is None else mirror.poses(take.poses)
-        clips.append(Clip(control_vectors(layout, poses)[kept], coefficients, good))
+        clips.append(Clip(control_vectors(layout, poses)[kept], projected[piece, mirror is None], good))
     return clips
 
 
@@ -125,14 +135,19 @@ def fitting_clips(
     layout: ControlLayout,
     space: ShapeSpace,
     mirror: Mirror | None = None,
+    projected: Projected | None = None,
 ) -> FittingClips:
     """What regressors are fitted to: the training clips, as they are and in the mirror, and the validation clips; in
     the end those in the mirror as well."""
-    training, validation = (regression_clips(takes, pieces, role, layout, space) for role in ("training", "validation"))
+
+    def clips(role: Role, mirror: Mirror | None) -> list[Clip]:
+        return regression_clips(takes, pieces, role, layout, space, mirror, projected)
+
+    training, validation = clips("training", None), clips("validation", None)
     known, late = list(training), list(validation)
     if mirror is not None:
-        known += regression_clips(takes, pieces, "training", layout, space, mirror)
-        late += regression_clips(takes, pieces, "validation", layout, space, mirror)
+        known += clips("training", mirror)
+        late += clips("validation", mirror)
     return FittingClips(known, validation, [*known, *late])
 
 

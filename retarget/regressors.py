@@ -235,9 +235,8 @@ def _load_layout(file: TensorFile) -> ControlLayout:
     """The layout in a file's note."""
     entry = dict(file.entry("layout"))
     try:
-        config = ControlConfig(**entry.pop("config"))
-        return ControlLayout(
-            tuple(entry["joint_names"]), tuple(int(joint) for joint in entry["joints"]), float(entry["fps"]), config
-        )
+        config = ControlConfig(**{**entry["config"], "lags": tuple(entry["config"].get("lags", ()))})
+        joints, parents = (tuple(int(joint) for joint in entry[name]) for name in ("joints", "parents"))
+        return ControlLayout(tuple(entry["joint_names"]), joints, float(entry["fps"]), config, parents)
     except (KeyError, TypeError) as error:
         raise InputError(f"{file.path}: damaged description of the controls ({error})") from None

@@ -35,9 +35,10 @@ from capture4d.workdir import Stage, open_stage, require_complete
 from capture4d.workers import run_jobs
 from retarget.blendshapes import ShapeSpace, as_model_arrays, shape_space, worst_errors
 from retarget.config import FitConfig
-from retarget.controls import ControlLayout, garment_joints
+from retarget.controls import ControlLayout
 from retarget.kernel import KernelRegressor, fit_kernel, load_kernel, save_kernel
 from retarget.learning import (
+    Projected,
     Take,
     UnposedTakes,
     fitting_clips,
@@ -51,8 +52,8 @@ from retarget.linear import LinearRegressor, fit_linear, load_linear, save_linea
 from retarget.mirroring import Mirror, find_mirror
 from retarget.pose_normalisation import PoseRows, unpose_sequence
 from retarget.pose_range import PoseRange, load_pose_range, save_pose_range
-from retarget.regressors import Clip, FittingClips, Regressor, mean_squared_error
-from retarget.splits import ROLES, Piece, Role, split_takes
+from retarget.regressors import FittingClips, Regressor, mean_squared_error
+from retarget.splits import ROLES, Piece, split_takes
 
 __all__ = ["GarmentModel", "load_garment_model", "run"]
 
@@ -101,16 +102,11 @@ def run(
     takes = _stacked(stage, works, names, body, moving)
     pieces = split_takes(names, [len(take.good) for take in takes.takes], takes.takes[0].poses.fps, config.split)
     model, shape_note = _blendshapes(stage, works, takes, pieces, body, person, config)
-    layout = ControlLayout(
-        body.joint_names,
-        garment_joints(takes.skin_weights, body.parents, config.control.joint_share),
-        takes.takes[0].poses.fps,
-        config.control,
-    )
+    layout = ControlLayout.create(body, takes.skin_weights, takes.takes[0].poses.fps, config.control)
     mirror = find_mirror(model.garment.template.with_vertices(model.mean), body.joint_names, config.mirror)
     known = training_poses(takes, pieces, layout, mirror)
     save_pose_range(output / POSES, known, model_digest=_digest(output))
-    note = shape_note | _regressors(stage, takes, pieces, layout, shape_space(model), mirror, config, device)
+    note = shape_note | _regressors(stage, takes, pieces, layout, shape_space(model), mirror, body, config, device)
     split = {role: [_piece_name(names, piece) for piece in pieces if piece.role == role]
              for role in ROLES}  # fmt: skip
     write_json(output / "fit.json", {"split": split, "validated_deg": known.validated_deg, **note})
@@ -255,18 +251,20 @@ def _regressors(
     layout: ControlLayout,
     space: ShapeSpace,
     mirror: Mirror | None,
+    body: Body,
     config: FitConfig,
     device: str,
 ) -> dict[str, Any]:
     """Learn what is not there yet, and measure all of it."""
     digest = _digest(stage.path)
-    clips: dict[Role, list[Clip]] = {role: regression_clips(takes, pieces, role, layout, space) for role in ROLES}
-    lesson = fitting_clips(takes, pieces, layout, space, mirror)
+    projected: Projected = {}
+    lesson = fitting_clips(takes, pieces, layout, space, mirror, projected)
     linear = fit_linear(lesson, layout, space.std, config.linear)
     save_linear(stage.path / LINEAR, linear, model_digest=digest)
     regressors: dict[str, Regressor] = {"linear": linear}
     if config.regressor != "linear":
-        kernel = fit_kernel(lesson, layout, space.std, config.kernel)
+        own = ControlLayout.create(body, takes.skin_weights, layout.fps, config.kernel.control)
+        kernel = fit_kernel(fitting_clips(takes, pieces, own, space, mirror, projected), own, space.std, config.kernel)
         save_kernel(stage.path / KERNEL, kernel, model_digest=digest)
         regressors["kernel"] = kernel
     if config.regressor == "all":
@@ -278,8 +276,8 @@ def _regressors(
     }
     for name, regressor in regressors.items():
         note[name] = {"ridge": regressor.ridge} if isinstance(regressor, (LinearRegressor, KernelRegressor)) else {}
-        for role, known in clips.items():
-            if known:
+        for role in ROLES:
+            if known := regression_clips(takes, pieces, role, regressor.layout, space, None, projected):
                 error = vertex_error_m(takes, pieces, role, space, predictions(regressor, known))
                 note[name][role.replace(" ", "_")] = {
                     "coefficient_mse_mm2": 1e6 * mean_squared_error(regressor, known),
