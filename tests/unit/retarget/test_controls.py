@@ -14,7 +14,7 @@ NAMES = ("root", "middle", "top")
 
 
 def layout(**settings) -> ControlLayout:
-    return ControlLayout(NAMES, (1, 2), 60.0, ControlConfig(**settings))
+    return ControlLayout(NAMES, (1, 2), 60.0, ControlConfig(**settings), (-1, 0, 1))
 
 
 def test_joints_are_those_that_carry_the_garment_and_those_above_them() -> None:
@@ -56,7 +56,22 @@ def test_a_missing_frame_does_not_change_the_speed(motion) -> None:
     np.testing.assert_allclose(speed, np.sqrt(3), rtol=1e-4)
 
 
-@pytest.mark.parametrize("settings", [{}, {"up": True, "joint_velocity": True}, {"root_motion": False}])
+def test_whole_rotations_are_products_and_lags_are_differences_to_earlier_frames(motion) -> None:
+    poses = motion(12, 0)
+    chosen = layout(whole_rotations=True, lags=(2, 30), root_motion=False)
+    rows = control_vectors(chosen, poses)
+    assert rows.shape == (12, chosen.size) == (12, 3 * 24)
+    top = poses.rotations[:, 1].astype(float) @ poses.rotations[:, 2] - np.eye(3)
+    np.testing.assert_allclose(rows[:, 18:24], top[:, :, :2].reshape(12, 6), atol=1e-6)
+    np.testing.assert_allclose(rows[2:, 24:48], rows[2:, :24] - rows[:-2, :24], atol=1e-6)
+    np.testing.assert_allclose(rows[:2, 24:48], rows[:2, :24] - rows[0, :24], atol=1e-6)
+    np.testing.assert_allclose(rows[:, 48:], rows[:, :24] - rows[0, :24], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{}, {"up": True, "joint_velocity": True}, {"root_motion": False}, {"whole_rotations": True, "lags": (3, 9)}],
+)
 def test_streaming_equals_batch_and_never_looks_ahead(motion, settings) -> None:
     poses, chosen = motion(25, 1), layout(**settings)
     whole = control_vectors(chosen, poses)

@@ -334,7 +334,7 @@ def test_a_killed_run_ends_with_the_same_bits(tmp_path: Path) -> None:
 
 
 def test_files_come_back_as_they_were_and_wrong_ones_are_one_line(clips, tmp_path: Path) -> None:
-    known, chosen = clips(count=2), layout(up=True)
+    known, chosen = clips(count=2), layout(up=True, lags=(4,))
     known = clips(count=2, chosen=chosen)
     linear = fit_linear(FittingClips(known[:1], known[1:], known[:1]), chosen, spread(known), LinearConfig())
     config = LstmConfig(layers=1, size=8, over_linear=True)
