@@ -137,18 +137,21 @@ def fitting_clips(
     mirror: Mirror | None = None,
     projected: Projected | None = None,
 ) -> FittingClips:
-    """What regressors are fitted to: the training clips, as they are and in the mirror, and the validation clips; in
-    the end those in the mirror as well."""
+    """What regressors are fitted to: the training clips, as they are and in the mirror, and in the end the validation
+    clips as well; but not the end of a take whose beginning was learned from, for it is all there is to show what came
+    of it.
+    """
+    begun = {piece.take for piece in pieces if piece.role == "training"}
+    learned = [piece for piece in pieces if piece.role == "training"]
+    late = [piece for piece in pieces if piece.role == "validation" and piece.take not in begun]
 
-    def clips(role: Role, mirror: Mirror | None) -> list[Clip]:
-        return regression_clips(takes, pieces, role, layout, space, mirror, projected)
+    def clips(pieces: Sequence[Piece], role: Role) -> list[Clip]:
+        found = regression_clips(takes, pieces, role, layout, space, None, projected)
+        return found + (regression_clips(takes, pieces, role, layout, space, mirror, projected) if mirror else [])
 
-    training, validation = clips("training", None), clips("validation", None)
-    known, late = list(training), list(validation)
-    if mirror is not None:
-        known += clips("training", mirror)
-        late += clips("validation", mirror)
-    return FittingClips(known, validation, [*known, *late])
+    training = clips(learned, "training")
+    validation = regression_clips(takes, pieces, "validation", layout, space, None, projected)
+    return FittingClips(training, validation, [*training, *clips(late, "validation")])
 
 
 def vertex_error_m(

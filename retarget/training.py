@@ -80,10 +80,12 @@ def fit_lstm(
             clips.all, (), layout, std, folder / "final", lstm=lstm, config=config, linear=linear, device=device
         )
     alone = fit_linear(clips.settled, layout, std, replace(linear_config, ridges=(linear.ridge,)))
-    train_lstm(
+    found = train_lstm(
         clips.training, clips.validation, layout, std, folder / "training",
         lstm=lstm, config=config, linear=alone, device=device,
     )  # fmt: skip
+    if len(clips.all) == len(clips.training):
+        return found
     records = (folder / "training" / METRICS).read_text().splitlines()
     enough = json.loads(records[-1])["best_epoch"] + 1
     epochs = config.epochs or _usual_epochs(sum(int(clip.good.sum()) for clip in clips.training), config)

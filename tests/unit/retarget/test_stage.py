@@ -94,6 +94,20 @@ def test_fit_finds_the_waves_and_says_so(model: Path, works, make_world) -> None
     assert not (model / "unposed").exists()
 
 
+def test_validation_takes_are_learned_from_in_the_end_but_not_the_end_of_the_only_take(
+    model: Path, write_work, motion, make_world, tmp_path: Path
+) -> None:
+    def learned_frames(folder: Path) -> int:
+        return len(read_tensors(folder / "kernel.safetensors", "capture4d kernel regressor")["frames"])
+
+    assert learned_frames(model) == 3 * 15  # one frame of each take is flagged
+    work = write_work(tmp_path / "only", motion(60, 0), world=make_world(waves=3))
+    assert run("fit", work, "--output", tmp_path / "alone", *QUICK) == 0
+    split = read_json(tmp_path / "alone" / "retarget" / "fit.json")["split"]
+    assert split == {"training": ["only[0:21]"], "validation": ["only[51:60]"], "held out": []}
+    assert learned_frames(tmp_path / "alone" / "retarget") == 21
+
+
 def test_fit_again_changes_nothing_and_other_settings_are_refused(model: Path, works, capsys) -> None:
     again = ("fit", *works, "--output", model.parent, "--split.validation", "take2", "--licence", "CC0")
     before = {path.name: path.read_bytes() for path in model.glob("*.safetensors")}
