@@ -4,9 +4,11 @@ Ridge regression with a sum of Gaussian kernels. What "like" means is taken from
 for a control counts by as much as it moves the garment:
 
 - over everything: two frames are alike if the linear regression puts the garment in the same place;
-- over each side of the body, and over its middle: two frames are alike if the joints there are turned alike, each
-  rotation weighted by how far the garment moves with it. A fold at one shoulder is learned without waiting for every
-  pose of the other.
+- over each side of the body, and over its middle, the same of what the joints there contribute;
+- over each of these again: two frames are alike if the joints there are turned alike, each rotation weighted by how far
+  the garment moves with it.
+
+So a fold at one shoulder is learned without waiting for every pose of the other.
 
 Letters: N learned frames, D controls, K coefficients, V views.
 """
@@ -41,8 +43,8 @@ __all__ = ["KernelRegressor", "fit_kernel", "load_kernel", "save_kernel"]
 _KIND = "capture4d kernel regressor"
 BATCH = 1024
 """Frames that are answered together."""
-FROM_EVERYTHING = 0.5
-"""Weight of the kernel over everything; the sides share the rest."""
+STILL = 1e-6
+"""A side that moves the garment by less than this share of what everything does has no kernels of its own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,12 +124,10 @@ def _fit(
         raise InputError(f"takes: expected at least 2 good frames to learn from, found {len(controls)}")
     scales = Scales.of(controls, np.asarray(std, np.float32), layout)
     known, middle = scales.standardised(controls), wanted.mean(axis=0)
-    views = _views(known, wanted, layout, config)
+    views, shares = _views(known, wanted, layout, config)
     if len(known) > config.most_frames:
         kept = np.linspace(0, len(known) - 1, config.most_frames).round().astype(int)
         known, wanted = known[kept], wanted[kept]
-    sides = len(views) - 1
-    shares = np.array([FROM_EVERYTHING, *[(1 - FROM_EVERYTHING) / sides] * sides]) if sides else np.ones(1)
     seen = _seen(known, views)
     likeness = _likeness(seen, seen, shares)
     found = []
@@ -136,7 +136,7 @@ def _fit(
         answers = cho_solve(factor, wanted - middle, check_finite=False)
         found.append(
             KernelRegressor(
-                layout, scales, views, shares.astype(np.float32), known,
+                layout, scales, views, shares, known,
                 answers.astype(np.float32), middle.astype(np.float32), ridge,
             )
         )  # fmt: skip
@@ -148,20 +148,22 @@ def _views(
     wanted: Float64[np.ndarray, "frames shapes"],
     layout: ControlLayout,
     config: KernelConfig,
-) -> tuple[Float32[np.ndarray, "controls _"], ...]:
-    """What the kernels compare: the linear regression's answers, and the rotations of each side by what they count."""
+) -> tuple[tuple[Float32[np.ndarray, "controls _"], ...], Float32[np.ndarray, " views"]]:
+    """What the kernels compare, and their weights: everything has a third, what the sides contribute another, and their
+    rotations the last."""
     response = usual_response(known, wanted)
     relevance = np.linalg.norm(response, axis=1)
-    views = [response / np.sqrt(config.length * _usual_square(known @ response))]
-    square = config.side_length * _usual_square(known * relevance)
-    for side in _sides(layout):
-        share = float((relevance[side] ** 2).sum() / max((relevance**2).sum(), 1e-30))
-        if share > 1e-6:
-            features = np.flatnonzero(side)
-            view = np.zeros((known.shape[1], len(features)))
-            view[features, np.arange(len(features))] = relevance[features] / np.sqrt(square * share)
-            views.append(view)
-    return tuple(view.astype(np.float32) for view in views)
+    squares = relevance**2 / max(float((relevance**2).sum()), 1e-30)
+    places = config.length * _usual_square(known @ response)
+    turns = config.side_length * _usual_square(known * relevance)
+    views, sides = [response / np.sqrt(places)], []
+    for now, ever in _sides(layout):
+        if squares[now].sum() > STILL:
+            sides.append(np.where(ever[:, None], response, 0) / np.sqrt(places * squares[ever].sum()))
+            sides.append(np.diag(np.where(now, relevance, 0))[:, now] / np.sqrt(turns * squares[now].sum()))
+    views += sides
+    weights = np.array([1.0] + [2.0 / len(sides) for _ in sides], np.float32)
+    return tuple(view.astype(np.float32) for view in views), weights / weights.sum()
 
 
 def _usual_square(features: Float64[np.ndarray, "frames features"]) -> float:
@@ -169,17 +171,23 @@ def _usual_square(features: Float64[np.ndarray, "frames features"]) -> float:
     return max(2 * float(features.var(axis=0).sum()), 1e-30)
 
 
-def _sides(layout: ControlLayout) -> list[np.ndarray]:
-    """(D,) bool each: the rotations of joints in the middle, on one side, on the other; or all, of a skeleton whose
-    names tell no sides."""
+def _sides(layout: ControlLayout) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Controls of the joints in the middle, on one side, on the other, (D,) bool each: their rotations now, and those
+    with how far they have come. All joints together, where their names tell no sides."""
     try:
         opposite = opposite_joints(layout.joint_names)
     except InputError:
         opposite = np.arange(len(layout.joint_names))
     joints = np.array(layout.joints, int)
-    sides = (opposite[joints] == joints, opposite[joints] > joints, opposite[joints] < joints)
-    others = np.zeros(layout.size - 6 * len(joints) * layout.rotation_sets, bool)
-    return [np.concatenate([*[np.repeat(side, 6)] * layout.rotation_sets, others]) for side in sides if side.any()]
+    found = []
+    for side in (opposite[joints] == joints, opposite[joints] > joints, opposite[joints] < joints):
+        if side.any():
+            rotations = np.tile(np.repeat(side, 6), layout.rotation_sets)
+            lags = np.tile(rotations, len(layout.config.lags))
+            between = np.zeros(layout.size - len(rotations) - len(lags), bool)
+            now = np.concatenate([rotations, between, np.zeros(len(lags), bool)])
+            found.append((now, np.concatenate([rotations, between, lags])))
+    return found
 
 
 def _seen(
