@@ -89,7 +89,7 @@ class KernelConfig:
     side_length: float = 1.5
     """The same of the kernels over the sides of the body."""
     ridges: tuple[float, ...] = (0.15,)
-    """Penalty; a frame's likeness to itself is 1. Of several the validation clips choose, which few clips do badly; this
+    """Penalty; a frame's likeness to itself is 1. Of several the validation clips choose, badly if they are few; this
     one was best when each clip was left out in turn."""
     most_frames: int = 4000
     """Learn from no more frames than so many, evenly spread: memory grows with their square, time with their cube."""
