@@ -29,6 +29,9 @@ __all__ = ["BodySurface", "IntersectionRemoval", "Penetration", "Removed"]
 
 EDGE_MIDDLES = np.array([[1, 1, 0], [0, 1, 1], [1, 0, 1], [2 / 3, 2 / 3, 2 / 3]]) / 2
 """Where a face is probed: the middles of its edges, and its own."""
+THINNEST_M, SLACK_M = 0.03, 0.001
+"""A limb of this radius bulges through a face by its longest edge squared over eight radii, and some slack. Deeper, the
+face spans a crease, of an arm against the trunk, and pushing its corners out would blow it up."""
 TOLERANCE, MOST_STEPS = 1e-6, 200
 """Relative residual at which conjugate gradients stop; the preconditioner leaves them a condition of `leave`/`stay`."""
 
@@ -109,11 +112,13 @@ class IntersectionRemoval:
         heights, normals = body.heights(start)
         before, was_inside = Penetration.of(heights), heights < 0
         wanted, leaving = np.zeros_like(start), np.zeros(len(start), bool)
+        edges = start[np.roll(self._faces, -1, axis=1)] - start[self._faces]
+        bulge = SLACK_M + np.linalg.norm(edges, axis=2).max(axis=1) ** 2 / (8 * THINNEST_M)
         moved, leave = np.zeros_like(start), config.leave
         for _ in range(config.rounds if config.enabled else 0):
             push = np.where((heights < 0)[:, None], (margin - heights)[:, None] * normals, 0.0)
             if config.faces:
-                push = self._push_faces(start + moved, heights, push, body, margin)
+                push = self._push_faces(start + moved, heights, push, body, margin, bulge)
             pushed = np.any(push != 0, axis=1)
             if not pushed.any():
                 break
@@ -130,10 +135,18 @@ class IntersectionRemoval:
         return Removed(result, before, after, np.linalg.norm(moved, axis=1), was_inside)
 
     def _push_faces(
-        self, points: np.ndarray, heights: np.ndarray, push: np.ndarray, body: BodySurface, margin: float
+        self,
+        points: np.ndarray,
+        heights: np.ndarray,
+        push: np.ndarray,
+        body: BodySurface,
+        margin: float,
+        bulge: np.ndarray,
     ) -> np.ndarray:
-        """The same for the corners of faces that the body pokes through, (V, 3), the longest push of each."""
-        near = self._faces[(heights[self._faces] >= 0).all(axis=1) & (heights[self._faces].min(axis=1) < 0.02)]
+        """The same for the corners of faces that the body pokes through, by less than `bulge` (F,); (V, 3), the longest
+        push of each."""
+        chosen = (heights[self._faces] >= 0).all(axis=1) & (heights[self._faces].min(axis=1) < 0.02)
+        near, bulge = self._faces[chosen], bulge[chosen]
         if not len(near):
             return push
         probes = np.einsum("pk,fkx->fpx", EDGE_MIDDLES, points[near]).reshape(-1, 3)
@@ -143,7 +156,7 @@ class IntersectionRemoval:
         depth, normal = below[rows, deepest, 0], normals[rows, deepest]
         result = push.copy()
         for corner in range(3):
-            for row in np.flatnonzero(depth < 0):
+            for row in np.flatnonzero((depth < 0) & (depth > -bulge)):
                 vertex = near[row, corner]
                 if np.linalg.norm(result[vertex]) < margin - depth[row]:
                     result[vertex] = (margin - depth[row]) * normal[row]
