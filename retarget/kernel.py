@@ -32,9 +32,10 @@ from retarget.regressors import (
     Clip,
     FittingClips,
     Scales,
-    mean_squared_error,
+    good_frames,
     read_regressor,
     usual_response,
+    with_best_ridge,
     write_regressor,
 )
 
@@ -103,11 +104,7 @@ def fit_kernel(
     Raises:
         InputError: there are not two good frames.
     """
-    if not clips.validation or len(config.ridges) == 1:
-        return _fit(clips.all, layout, std, config, config.ridges)[0]
-    candidates = _fit(clips.training, layout, std, config, config.ridges)
-    best = min(candidates, key=lambda candidate: mean_squared_error(candidate, clips.validation))
-    return _fit(clips.all, layout, std, config, (best.ridge,))[0]
+    return with_best_ridge(clips, config.ridges, lambda known, ridges: _fit(known, layout, std, config, ridges))
 
 
 def _fit(
@@ -118,10 +115,7 @@ def _fit(
     ridges: Sequence[float],
 ) -> list[KernelRegressor]:
     """One regressor for each ridge."""
-    controls = np.concatenate([clip.controls[clip.good] for clip in clips]).astype(np.float64)
-    wanted = np.concatenate([clip.coefficients[clip.good] for clip in clips]).astype(np.float64)
-    if len(controls) < 2:
-        raise InputError(f"takes: expected at least 2 good frames to learn from, found {len(controls)}")
+    controls, wanted = good_frames(clips)
     scales = Scales.of(controls, np.asarray(std, np.float32), layout)
     known, middle = scales.standardised(controls), wanted.mean(axis=0)
     views, shares = _views(known, wanted, layout, config)

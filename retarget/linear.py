@@ -21,8 +21,9 @@ from retarget.regressors import (
     FittingClips,
     History,
     Scales,
-    mean_squared_error,
+    good_frames,
     read_regressor,
+    with_best_ridge,
     with_history,
     write_regressor,
 )
@@ -79,11 +80,8 @@ def fit_linear(
     Raises:
         InputError: there are not two good frames.
     """
-    if not clips.validation or config.fit == "moore-penrose" or len(config.ridges) == 1:
-        return _fit(clips.all, layout, std, config, config.ridges)[0]
-    candidates = _fit(clips.training, layout, std, config, config.ridges)
-    best = min(candidates, key=lambda candidate: mean_squared_error(candidate, clips.validation))
-    return _fit(clips.all, layout, std, config, (best.ridge,))[0]
+    ridges = (0.0,) if config.fit == "moore-penrose" else config.ridges
+    return with_best_ridge(clips, ridges, lambda known, ridges: _fit(known, layout, std, config, ridges))
 
 
 def _fit(
@@ -96,11 +94,7 @@ def _fit(
     """One regressor for each ridge."""
     whole = np.asarray(std, np.float32)
     history = layout.config.history
-    known = [with_history(clip, history, np.maximum(whole, 1e-6)) for clip in clips]
-    controls = np.concatenate([clip.controls[clip.good] for clip in known]).astype(np.float64)
-    wanted = np.concatenate([clip.coefficients[clip.good] for clip in known]).astype(np.float64)
-    if len(controls) < 2:
-        raise InputError(f"takes: expected at least 2 good frames to learn from, found {len(controls)}")
+    controls, wanted = good_frames([with_history(clip, history, np.maximum(whole, 1e-6)) for clip in clips])
     scales = Scales.of(controls, whole, layout)
     if config.fit == "moore-penrose":
         plain = Scales(np.zeros_like(scales.control_mean), np.ones_like(scales.control_std), scales.std)

@@ -8,10 +8,10 @@ Letters: T frames, D controls (with the history), K coefficients.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64
@@ -28,9 +28,11 @@ __all__ = [
     "Regressor",
     "Scales",
     "Stream",
+    "good_frames",
     "mean_squared_error",
     "read_regressor",
     "usual_response",
+    "with_best_ridge",
     "with_history",
     "write_regressor",
 ]
@@ -100,6 +102,16 @@ class Regressor(Protocol):
     def predict(self, controls: Float32[np.ndarray, "frames controls"]) -> Float32[np.ndarray, "frames shapes"]:
         """The coefficients of a whole motion."""
         ...
+
+
+class RidgeRegressor(Regressor, Protocol):
+    """A regressor with a penalty."""
+
+    @property
+    def ridge(self) -> float: ...
+
+
+Ridged = TypeVar("Ridged", bound=RidgeRegressor)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -192,6 +204,34 @@ def mean_squared_error(regressor: Regressor, clips: Sequence[Clip]) -> float:
         total += float((errors**2).sum())
         count += errors.size
     return total / max(count, 1.0)
+
+
+def good_frames(
+    clips: Sequence[Clip],
+) -> tuple[Float64[np.ndarray, "frames controls"], Float64[np.ndarray, "frames shapes"]]:
+    """Controls and coefficients of all good frames, in their own units.
+
+    Raises:
+        InputError: there are not two.
+    """
+    controls = np.concatenate([clip.controls[clip.good] for clip in clips]).astype(np.float64)
+    if len(controls) < 2:
+        raise InputError(f"takes: expected at least 2 good frames to learn from, found {len(controls)}")
+    return controls, np.concatenate([clip.coefficients[clip.good] for clip in clips]).astype(np.float64)
+
+
+def with_best_ridge(
+    clips: FittingClips, ridges: Sequence[float], fit: Callable[[Sequence[Clip], Sequence[float]], list[Ridged]]
+) -> Ridged:
+    """The ridge regression with the penalty that the validation clips choose, learned from all clips.
+
+    Args:
+        fit: one regressor for each ridge, from some clips.
+    """
+    if clips.validation and len(ridges) > 1:
+        candidates = fit(clips.training, ridges)
+        ridges = [min(candidates, key=lambda candidate: mean_squared_error(candidate, clips.validation)).ridge]
+    return fit(clips.all, ridges)[0]
 
 
 # --- files -------------------------------------------------------------------------------------------------------
