@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.renewal import renew
 from capture4d.app.pipeline import run_stages
 from capture4d.body import ShapedBody, with_shape
 from capture4d.evaluation import material_points
@@ -68,7 +70,8 @@ def registered_takes(
     works = []
     for name in names:
         works.append(folder / "works" / name)
-        run_stages(folder / "takes" / name, works[-1], RegistrationConfig(), track=tracked, workers=workers)
+        capture = folder / "takes" / name
+        renew(partial(run_stages, capture, works[-1], RegistrationConfig(), track=tracked, workers=workers))
     return works
 
 

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial import KDTree
 
-from capture4d import garment_stage
+from benchmarks.renewal import renew
+from capture4d.app.pipeline import run_stages
 from capture4d.cache import user_cache_folder
-from capture4d.garment_stage import run as extract
 from data_synth.cached_takes import cached_take
 from data_synth.config import PRESETS, SynthConfig
-from registration import stage as registration_stage
 from registration.config import RegistrationConfig
-from registration.stage import run as register
 
 __all__ = ["QUICK_TAKE", "locate_texels", "registered_work"]
 
@@ -24,14 +23,10 @@ QUICK_TAKE = replace(PRESETS["tiny"], frames=12, capture_every=1)
 
 
 def registered_work(config: SynthConfig, *, workers: int) -> tuple[Path, Path]:
-    """The capture of a configuration, and a work folder with its garments and registration.
-
-    Works of earlier code, whose stages had other schema numbers, are left where they are and made anew.
-    """
+    """The capture of a configuration, and a work folder with its garments and registration."""
     capture = cached_take(config, workers=workers)
-    work = user_cache_folder() / "works" / f"{capture.name}-{garment_stage.SCHEMA}-{registration_stage.SCHEMA}"
-    extract(capture, work / "garment", workers=workers)
-    register(capture, work / "garment", work / "registration", RegistrationConfig(), workers=workers)
+    work = user_cache_folder() / "works" / capture.name
+    renew(partial(run_stages, capture, work, RegistrationConfig(), workers=workers))
     return capture, work
 
 

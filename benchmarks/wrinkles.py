@@ -21,6 +21,7 @@ import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import get_args
 
@@ -31,6 +32,7 @@ from rich.table import Table
 
 from benchmarks.learning_takes import learned_takes, registered_takes, training_set
 from benchmarks.metric import Metric
+from benchmarks.renewal import renew
 from capture4d.body import with_shape
 from capture4d.errors import InputError
 from capture4d.records import save_body, save_poses
@@ -141,7 +143,7 @@ def run(
         clips, base = _Clips(train, like, unlike, PairConfig()), PRESETS["small"]
     base = replace(base, held_out=0.0)
     for work in clips.all:
-        make_pairs(work, clips.pairs, workers=workers)
+        renew(partial(make_pairs, work, clips.pairs, workers=workers))
     results, unlike_ratios, evidence = [], [], []
     with tempfile.TemporaryDirectory() as scratch:
         folder = keep or Path(scratch)

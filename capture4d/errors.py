@@ -1,6 +1,6 @@
-"""The exception that means "the input is at fault, not the program", and two faults that callers tell apart."""
+"""The exception that means "the input is at fault, not the program", and three faults that callers tell apart."""
 
-__all__ = ["EmptyMeshError", "InputError", "NotFiniteError"]
+__all__ = ["EmptyMeshError", "InputError", "NotFiniteError", "StaleError"]
 
 
 class InputError(ValueError):
@@ -18,3 +18,7 @@ class EmptyMeshError(InputError):
 
 class NotFiniteError(InputError):
     """NaN or infinity among numbers that have to be finite."""
+
+
+class StaleError(InputError):
+    """A stage's earlier output, made with other settings or from other inputs."""

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from capture4d.atomic_files import TEMPORARY_SUFFIX, file_digest, plain_value, read_json, write_json
-from capture4d.errors import InputError
+from capture4d.errors import InputError, StaleError
 
 __all__ = ["Stage", "open_stage", "require_complete"]
 
@@ -100,7 +100,8 @@ def open_stage(
         formerly: an earlier `upstream` whose results still hold; a folder that was made from it is taken over.
         overwrite: start clean; deletes everything in the folder, if it is this stage's.
     Raises:
-        InputError: the folder holds something else, or this stage made with other settings or from other inputs.
+        InputError: the folder holds something else.
+        StaleError: it holds this stage, made with other settings or from other inputs.
     """
     folder = Path(folder)
     record_path = folder / "stage.json"
@@ -126,7 +127,7 @@ def open_stage(
     if existing is not None:
         changed = list(_differences(settings, existing))
         if changed:
-            raise InputError(f"{folder}: was made with other settings ({'; '.join(changed[:3])}); use --overwrite")
+            raise StaleError(f"{folder}: was made with other settings ({'; '.join(changed[:3])}); use --overwrite")
         started = existing.get("started", _now())
     else:
         started = _now()
@@ -143,8 +144,8 @@ def require_complete(folder: str | Path, name: str, command: str, *, made_from: 
     Args:
         made_from: digests of inputs that it has to have been made from, by name.
     Raises:
-        InputError: it is missing, unfinished, or made from something else; the message names `command`, which repairs
-            that.
+        InputError: it is missing or unfinished; the message names `command`, which repairs that.
+        StaleError: it was made from something else.
     """
     folder = Path(folder)
     if not (folder / "stage.json").is_file():
@@ -156,7 +157,7 @@ def require_complete(folder: str | Path, name: str, command: str, *, made_from: 
         raise InputError(f"{folder}: '{name}' is not finished; run: {command}")
     for key, digest in (made_from or {}).items():
         if record.get("upstream", {}).get(key) != digest:
-            raise InputError(
+            raise StaleError(
                 f"{folder}: expected the output of '{name}' from this {key} as it is now, found that of another or of "
                 f"an earlier state; run: {command} --overwrite"
             )
