@@ -18,8 +18,11 @@ class ImageDecoder(nn.Module):
     """Pose to the front and back images of a whole shirt: 90 numbers to 256 x 256 x 6 in 3,785,322 parameters.
 
     The first layer is an 8 x 8 transposed convolution on a 1 x 1 image; five more double the size and halve the
-    channels. All carry biases: the count that the paper prints tells.
+    channels. All carry biases: the count that the paper prints tells. `mean` is an image that is added to what comes
+    out; the paper has none (zeros), so its layers learn the garment's own shape besides how it moves.
     """
+
+    mean: Tensor
 
     def __init__(self, pose_size: int = 90, *, channels: int = 384, doublings: int = 5) -> None:
         super().__init__()
@@ -28,9 +31,10 @@ class ImageDecoder(nn.Module):
             layers += [nn.ConvTranspose2d(channels, channels // 2, 4, 2, 1), nn.BatchNorm2d(channels // 2), nn.ReLU()]
             channels //= 2
         self.layers = nn.Sequential(*layers, nn.Conv2d(channels, 6, 3, 1, 1))
+        self.register_buffer("mean", torch.zeros(6, 1, 1).repeat(1, 8 << doublings, 8 << doublings))
 
     def forward(self, pose: Float[Tensor, "B pose"]) -> Float[Tensor, "B 6 size size"]:
-        return self.layers(pose[:, :, None, None])
+        return self.mean + self.layers(pose[:, :, None, None])
 
 
 class FullyConnected(nn.Module):
