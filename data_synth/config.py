@@ -304,7 +304,7 @@ TRAINING_SETS: dict[str, TrainingSetConfig] = {
     ),
 }
 """Sets of takes by name. `tshirt-train` has 2,100 frames with scans and 1,200 without, which by the costs that
-`python -m benchmarks synthesis` prints is about 16,000 CPU seconds; `tiny-train` is its small likeness."""
+`python -m benchmarks synthesis` prints is about 13,000 CPU seconds; `tiny-train` is its small likeness."""
 
 
 @dataclass(frozen=True, slots=True)
