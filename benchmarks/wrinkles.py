@@ -36,7 +36,6 @@ from benchmarks.renewal import renew
 from capture4d.body import with_shape
 from capture4d.errors import InputError
 from capture4d.records import save_body, save_poses
-from capture4d.uv_layout import millimetres_per_texel
 from capture4d.work_folder import load_moving_body, load_registration
 from retarget.animate_stage import run as animate
 from retarget.blendshapes import project, shape_space
@@ -59,6 +58,7 @@ from wrinkles.inference import WrinkleModel, load_model
 from wrinkles.map_metrics import MapScores
 from wrinkles.networks import UNet
 from wrinkles.pair_files import load_pairs, pair_template
+from wrinkles.pair_stage import ensure_pairs
 from wrinkles.pair_stage import run as make_pairs
 from wrinkles.pairs import fitted
 from wrinkles.train_stage import run as train_network
@@ -141,9 +141,14 @@ def run(
         raise InputError("benchmarks wrinkles: expected --train, --like and --unlike together, or none of them")
     else:
         clips, base = _Clips(train, like, unlike, PairConfig()), PRESETS["small"]
+        if len({work.name for work in clips.all}) < len(clips.all):
+            raise InputError("benchmarks wrinkles: expected work folders of different names, found two alike")
     base = replace(base, held_out=0.0)
     for work in clips.all:
-        renew(partial(make_pairs, work, clips.pairs, workers=workers))
+        if train:
+            ensure_pairs(work, clips.pairs, workers=workers)
+        else:
+            renew(partial(make_pairs, work, clips.pairs, workers=workers))
     results, unlike_ratios, evidence = [], [], []
     with tempfile.TemporaryDirectory() as scratch:
         folder = keep or Path(scratch)
@@ -248,9 +253,7 @@ def _trained(clips: _Clips, config: WrinkleConfig, output: Path, workers: int) -
 def _scored(model: WrinkleModel, works: Sequence[Path]) -> _Result:
     made, low = [], []
     for work in works:
-        mesh = pair_template(work)
-        take = fitted(load_pairs(work), model.texels)
-        scores = score_take(model, take, millimetres_per_texel(mesh, model.texels))
+        scores = score_take(model, fitted(load_pairs(work), model.texels), pair_template(work))
         made.append(scores[0])
         low.append(scores[1])
     return _Result(_mean(made), _mean(low))
@@ -261,8 +264,8 @@ def _norm_evidence(model: WrinkleModel, works: Sequence[Path]) -> dict[str, floa
     errors = {}
     for kind in ("running", "instance"):
         config = replace(model.config, norm_at_test=kind)
-        twin = WrinkleModel(UNet(config), config, texels=model.texels, map_size=model.map_size,
-                            layout_digest=model.layout_digest)  # fmt: skip
+        twin = WrinkleModel(UNet(config), config, texels=model.texels, maps=model.maps,
+                            layout_digest=model.layout_digest, reference=model.reference)  # fmt: skip
         twin.generator.load_state_dict(model.generator.state_dict())
         errors[kind] = _scored(twin, works).made.normal_error_deg
     return errors
@@ -301,7 +304,10 @@ def _milliseconds(config: WrinkleConfig, repeats: int, threads: int) -> float:
     torch.set_num_threads(threads)
     network = UNet(config.network).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     size = config.texels
-    model = WrinkleModel(network, config.network, texels=size, map_size=size, layout_digest="")
+    nobody = np.zeros((0, 3), np.float32)
+    model = WrinkleModel(
+        network, config.network, texels=size, maps=MapConfig(size=size), layout_digest="", reference=nobody
+    )
     low = torch.nn.functional.normalize(torch.randn(3, size, size), dim=0)
     times = []
     for _ in range(repeats + 1):

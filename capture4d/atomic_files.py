@@ -121,6 +121,27 @@ def read_json(path: str | Path) -> Any:
         raise InputError(f"{path}: not valid JSON ({error})") from None
 
 
+def read_json_lines(path: str | Path) -> list[dict[str, Any]]:
+    """Read a file with a JSON object a line; a missing or damaged file is an InputError that names it and the line."""
+    path = Path(path)
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not valid JSON ({error})") from None
+    rows = []
+    for number, line in enumerate(lines, start=1):
+        try:
+            row = json.loads(line)
+        except json.JSONDecodeError as error:
+            raise InputError(f"{path}: line {number}: not valid JSON ({error})") from None
+        if not isinstance(row, dict):
+            raise InputError(f"{path}: line {number}: expected a JSON object, found {type(row).__name__}")
+        rows.append(row)
+    return rows
+
+
 def file_digest(paths: Iterable[Path], *, root: Path) -> str:
     """SHA-256 over the names (relative to `root`) and contents of files, whatever order they come in."""
     total = hashlib.sha256()

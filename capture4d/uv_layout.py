@@ -16,7 +16,7 @@ from capture4d.mesh import face_areas
 from capture4d.tangents import TangentLayout
 from capture4d.types import Mesh
 
-__all__ = ["Layout", "millimetres_per_texel", "pack_islands", "unit_square"]
+__all__ = ["Layout", "millimetres_per_texel", "pack_islands", "unit_square", "uv_area"]
 
 Layout = Literal["auto", "keep", "pack"]
 METRIC_TOLERANCE = 0.35
@@ -33,10 +33,12 @@ def unit_square(mesh: Mesh, *, layout: Layout = "auto", gap: float) -> Mesh:
             in metres.
         gap: room between packed islands, as a share of the square's side.
     Raises:
-        InputError: there are no UVs, or they are neither in the unit square nor a pattern in metres.
+        InputError: there are no UVs, they have no area, or they are neither in the unit square nor a pattern in metres.
     """
     if mesh.uv is None:
         raise InputError("template: expected UVs, found none; `capture4d template --uv fresh` cuts some")
+    if uv_area(mesh) <= 0:
+        raise InputError("template: expected UVs that spread the surface out, found none with any area")
     low, high = float(mesh.uv.min(initial=0)), float(mesh.uv.max(initial=0))
     fits = low >= 0 and high <= 1
     if layout == "keep" or (layout == "auto" and not fits and not _is_metric(mesh)):
@@ -75,10 +77,11 @@ def pack_islands(
 def millimetres_per_texel(mesh: Mesh, size: int) -> float:
     """Length on the mesh that one texel shows, in the mean over the surface."""
     assert mesh.uv is not None
-    return 1e3 * float(np.sqrt(face_areas(mesh.vertices.astype(float), mesh.faces).sum() / _uv_area(mesh))) / size
+    return 1e3 * float(np.sqrt(face_areas(mesh.vertices.astype(float), mesh.faces).sum() / uv_area(mesh))) / size
 
 
-def _uv_area(mesh: Mesh) -> float:
+def uv_area(mesh: Mesh) -> float:
+    """Sum of the faces' areas in the UV plane."""
     assert mesh.uv is not None
     along, across = (mesh.uv[:, k].astype(float) - mesh.uv[:, 0] for k in (1, 2))
     return float(np.abs(along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]).sum() / 2)
@@ -86,7 +89,7 @@ def _uv_area(mesh: Mesh) -> float:
 
 def _is_metric(mesh: Mesh) -> bool:
     on_mesh = float(face_areas(mesh.vertices.astype(float), mesh.faces).sum())
-    return bool(abs(np.sqrt(_uv_area(mesh) / max(on_mesh, 1e-12)) - 1) < METRIC_TOLERANCE)
+    return bool(abs(np.sqrt(uv_area(mesh) / max(on_mesh, 1e-12)) - 1) < METRIC_TOLERANCE)
 
 
 def _boxes(uv: np.ndarray, island: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

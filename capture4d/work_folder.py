@@ -6,14 +6,13 @@ them: registration itself, or an animated model.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from capture4d.atomic_files import read_json, write_npy_rows
+from capture4d.atomic_files import read_json, read_json_lines, write_npy_rows
 from capture4d.body_anny import load_anny
 from capture4d.body_stage import load_tracking
 from capture4d.errors import InputError
@@ -29,6 +28,7 @@ __all__ = [
     "capture_path",
     "captured_motion",
     "failed_frames",
+    "find_moving_body",
     "is_animated",
     "load_moving_body",
     "load_records",
@@ -69,7 +69,7 @@ def stack_vertices(stage: Stage, frame_ids: Sequence[int]) -> None:
 
 def load_records(folder: Path) -> list[dict[str, Any]]:
     """The frames' measures and verdicts, from WORK/registration/metrics.jsonl."""
-    return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    return read_json_lines(folder / "metrics.jsonl")
 
 
 def failed_frames(work: Path) -> set[int]:
@@ -139,16 +139,22 @@ def captured_motion(capture: Capture) -> tuple[Body | None, PoseSequence | None]
 
 
 def load_moving_body(work: Path) -> tuple[Body, PoseSequence]:
-    """The body and the poses with which a take was registered: those that were tracked, or those of its capture.
+    """The body and the poses with which a take was registered.
 
     Raises:
         InputError: there are none.
     """
+    moving = find_moving_body(work)
+    if moving is None:
+        capture = capture_path(work)
+        raise InputError(f"{work}: expected poses in {capture}, found none; track the body and register again")
+    return moving
+
+
+def find_moving_body(work: Path) -> tuple[Body, PoseSequence] | None:
+    """The same, or None: those that were tracked, or those of the capture."""
     upstream = read_json(work / "registration" / "stage.json").get("upstream", {})
     if "body" in upstream or is_animated(work):
         return load_tracking(work / "body")
-    capture = read_capture(capture_path(work))
-    body, poses = captured_motion(capture)
-    if body is None or poses is None:
-        raise InputError(f"{work}: expected poses in {capture.path}, found none; track the body and register again")
-    return body, poses
+    body, poses = captured_motion(read_capture(capture_path(work)))
+    return None if body is None or poses is None else (body, poses)

@@ -14,6 +14,7 @@ fit.json                   what was learned from, how many directions, and the e
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -55,7 +56,7 @@ from retarget.pose_range import PoseRange, load_pose_range, save_pose_range
 from retarget.regressors import FittingClips, Regressor, mean_squared_error
 from retarget.splits import ROLES, Piece, split_takes
 
-__all__ = ["GarmentModel", "load_garment_model", "run"]
+__all__ = ["GarmentModel", "learned_frames", "load_garment_model", "run"]
 
 SCHEMA = 3
 MODEL, LINEAR, KERNEL, LSTM, POSES = (
@@ -120,8 +121,33 @@ def _finish(stage: Stage) -> str:
     return digest
 
 
+_PIECE = re.compile(r"(.*)\[(\d+):(\d+)\]")
+
+
 def _piece_name(names: Sequence[str], piece: Piece) -> str:
     return f"{names[piece.take]}[{piece.frames.start}:{piece.frames.stop}]"
+
+
+def learned_frames(folder: Path, registration: str) -> list[range]:
+    """The frames, as positions in its take, that a model's shapes or regressors were learned from.
+
+    The end of an only take validates and is not learned from; whole clips that validate are, once they have chosen.
+
+    Args:
+        folder: what `run` wrote.
+        registration: digest of the take's registration.
+    Raises:
+        InputError: files of the model are missing or damaged.
+    """
+    taken = read_json(folder / "stage.json").get("upstream", {})
+    names = [name for name, digest in taken.items() if digest == registration]
+    split = read_json(folder / "fit.json")["split"]
+    pieces = {role: [_PIECE.fullmatch(piece) for piece in split[role]] for role in ("training", "validation")}
+
+    def frames(role: str) -> list[range]:
+        return [range(int(piece[2]), int(piece[3])) for piece in pieces[role] if piece and piece[1] in names]
+
+    return frames("training") or frames("validation")
 
 
 # --- takes -------------------------------------------------------------------------------------------------------

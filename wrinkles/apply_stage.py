@@ -24,7 +24,6 @@ from capture4d.tangents import corner_tangents
 from capture4d.work_folder import load_registration, registered_digest
 from capture4d.workdir import Stage, open_stage
 from capture4d.workers import run_jobs
-from wrinkles.config import MapConfig
 from wrinkles.inference import WrinkleModel, load_model
 from wrinkles.map_spaces import encode_png, encode_png8, flip_green, to_tangent
 from wrinkles.normal_maps import MapTemplate
@@ -33,7 +32,7 @@ from wrinkles.seams import SeamTable, seam_table
 
 __all__ = ["ApplyConfig", "generated_normals", "run"]
 
-SCHEMA = 1
+SCHEMA = 2
 CHUNK = 32
 
 
@@ -43,7 +42,6 @@ class ApplyConfig:
 
     flip_green: bool = False
     bits: Literal[8, 16] = 16
-    map: MapConfig = MapConfig()
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,10 +60,9 @@ def run(model: Path, work: Path, config: ApplyConfig, *, workers: int = 1, overw
     """
     weights = model / "generator.safetensors" if model.is_dir() else model
     generator, digest = load_model(weights), registered_digest(work)
-    config = replace(config, map=replace(config.map, size=generator.map_size))
     sequence = load_registration(work / "registration")
-    template = MapTemplate.create(sequence.garment, config.map)
-    if layout_digest(template.mesh, config.map.size) != generator.layout_digest:
+    template = MapTemplate.create(sequence.garment, generator.maps)
+    if layout_digest(template.mesh, generator.maps.size) != generator.layout_digest:
         raise InputError(
             f"{work}: expected the template that {weights} was trained on, found another mesh or UV layout"
         )
@@ -94,7 +91,11 @@ def run(model: Path, work: Path, config: ApplyConfig, *, workers: int = 1, overw
 def generated_normals(
     model: WrinkleModel, template: MapTemplate, seams: SeamTable, vertices: Float[np.ndarray, "V 3"]
 ) -> Float32[np.ndarray, "N 3"]:
-    """The generator's world normals at the template's texels in a frame, alike on both sides of every seam."""
+    """The generator's world normals at the template's texels in a frame, alike on both sides of every seam.
+
+    Args:
+        template: referred to the generator's own.
+    """
     rotation = template.rotation(vertices).astype(np.float32)
     low = template.raster.image(template.low_normals(vertices) @ rotation)
     made = model.generate(torch.from_numpy(low).permute(2, 0, 1)).permute(1, 2, 0).numpy()
@@ -108,16 +109,17 @@ def _length(job: _Chunk) -> int:
 
 
 @lru_cache(maxsize=1)
-def _prepared(work: Path, weights: Path, config: MapConfig) -> tuple[WrinkleModel, MapTemplate, SeamTable]:
+def _prepared(work: Path, weights: Path) -> tuple[WrinkleModel, MapTemplate, SeamTable]:
     """One network and template per process."""
-    template = MapTemplate.create(load_registration(work / "registration").garment, config)
     torch.set_num_threads(1)
-    return load_model(weights), template, seam_table(template.mesh, template.raster)
+    model = load_model(weights)
+    template = MapTemplate.create(load_registration(work / "registration").garment, model.maps)
+    return model, template.referred_to(model.reference), seam_table(template.mesh, template.raster)
 
 
 def _make(config: ApplyConfig, job: _Chunk) -> int:
     """Make and write the missing maps of a chunk; how many there were."""
-    model, template, seams = _prepared(job.work, job.weights, config.map)
+    model, template, seams = _prepared(job.work, job.weights)
     sequence = load_registration(job.work / "registration")
     frame_ids = sequence.frame_ids.tolist()
     pending = set(job.stage.pending([frame_ids[position] for position in job.positions], ".png"))

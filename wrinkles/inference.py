@@ -6,14 +6,15 @@ import copy
 from dataclasses import asdict
 from pathlib import Path
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 from torch import Tensor
 from torch.nn import functional
 
 from capture4d.errors import InputError
 from capture4d.tensor_files import read_tensors, write_tensors
-from wrinkles.config import NetworkConfig
+from wrinkles.config import MapConfig, NetworkConfig
 from wrinkles.networks import UNet, set_test_statistics
 from wrinkles.training import load_weights
 
@@ -22,23 +23,33 @@ __all__ = ["WrinkleModel", "load_model", "save_model"]
 KIND = "a wrinkle generator"
 HALF_FROM = 32
 """Filters from which bfloat16 is faster on a CPU."""
-MAP_KEYS = ("texels", "map_size", "layout_digest")
+REFERENCE = "reference"
+"""Name of the template's vertices among the tensors."""
 
 
 class WrinkleModel:
     """A generator and the maps it was trained on."""
 
     def __init__(
-        self, generator: UNet, config: NetworkConfig, *, texels: int, map_size: int, layout_digest: str
+        self,
+        generator: UNet,
+        config: NetworkConfig,
+        *,
+        texels: int,
+        maps: MapConfig,
+        layout_digest: str,
+        reference: Float32[np.ndarray, "V 3"],
     ) -> None:
         self.generator = generator
         self.config = config
         self.texels = texels
         """Side of the maps the generator sees."""
-        self.map_size = map_size
-        """Side of the maps on disk."""
+        self.maps = maps
+        """Of the maps on disk."""
         self.layout_digest = layout_digest
         """Of the UV layout; other layouts mean nothing to the generator."""
+        self.reference = reference
+        """The template's vertices to which garment coordinates refer."""
         set_test_statistics(generator, config.norm_at_test)
         self._narrow: UNet | None = None
 
@@ -82,9 +93,14 @@ def _halved(image: Tensor, shown: Tensor) -> tuple[Tensor, Tensor]:
 
 def save_model(path: str | Path, model: WrinkleModel) -> None:
     """Write the weights and what is needed to rebuild the network."""
-    about = {"network": asdict(model.config)} | {key: getattr(model, key) for key in MAP_KEYS}
+    about = {
+        "network": asdict(model.config),
+        "texels": model.texels,
+        "maps": asdict(model.maps),
+        "layout_digest": model.layout_digest,
+    }
     weights = {name: tensor.numpy() for name, tensor in model.generator.state_dict().items()}
-    write_tensors(path, KIND, weights, about)
+    write_tensors(path, KIND, weights | {REFERENCE: model.reference}, about)
 
 
 def load_model(path: str | Path) -> WrinkleModel:
@@ -97,13 +113,17 @@ def load_model(path: str | Path) -> WrinkleModel:
     if not Path(path).is_file():
         raise InputError(f"{path}: no such file; run: capture4d wrinkles train WORK --output MODEL")
     file = read_tensors(path, KIND)
-    maps = {key: file.entry(key) for key in MAP_KEYS}
     try:
-        config = NetworkConfig(**file.entry("network"))
+        config, maps = NetworkConfig(**file.entry("network")), MapConfig(**file.entry("maps"))
     except (TypeError, ValueError) as error:
         raise InputError(f"{path}: expected the settings of a wrinkle generator, found others ({error})") from None
     with torch.device("meta"):
         generator = UNet(config)
     generator.to_empty(device="cpu")
-    load_weights(generator, {name: torch.from_numpy(each) for name, each in file.tensors.items()}, source=str(path))
-    return WrinkleModel(generator.to(memory_format=torch.channels_last), config, **maps)  # pyright: ignore[reportCallIssue]
+    reference = file[REFERENCE]
+    weights = {name: torch.from_numpy(each) for name, each in file.tensors.items() if name != REFERENCE}
+    load_weights(generator, weights, source=str(path))
+    return WrinkleModel(
+        generator.to(memory_format=torch.channels_last),  # pyright: ignore[reportCallIssue]
+        config, texels=file.entry("texels"), maps=maps, layout_digest=file.entry("layout_digest"), reference=reference,
+    )  # fmt: skip

@@ -30,10 +30,12 @@ class MapTemplate:
     """The template, its UVs in the unit square."""
     raster: UvRaster
     tangents: TangentLayout
+    reference: Float32[np.ndarray, "V 3"]
+    """The vertices to which garment coordinates refer."""
 
     @staticmethod
     def create(garment: Garment, config: MapConfig) -> MapTemplate:
-        """Lay out, rasterise and analyse.
+        """Lay out, rasterise and analyse. Garment coordinates refer to this garment's own template.
 
         Raises:
             InputError: the template has no UVs, or such as do not fit an image, or overlapping islands.
@@ -42,7 +44,11 @@ class MapTemplate:
         mesh = unit_square(garment.template, layout=config.layout, gap=gap)
         raster = rasterise_uv(mesh, config.size, padding=config.padding)
         assert mesh.uv is not None
-        return MapTemplate(mesh, raster, TangentLayout(mesh.faces, mesh.uv))
+        return MapTemplate(mesh, raster, TangentLayout(mesh.faces, mesh.uv), mesh.vertices)
+
+    def referred_to(self, reference: Float32[np.ndarray, "V 3"]) -> MapTemplate:
+        """The same with garment coordinates of another copy of the template: one network's, or another take's."""
+        return replace(self, reference=reference)
 
     def low_normals(self, vertices: Float[np.ndarray, "V 3"]) -> Float32[np.ndarray, "N 3"]:
         """The template's interpolated vertex normals in a frame: unit, world, per texel."""
@@ -55,7 +61,7 @@ class MapTemplate:
 
     def rotation(self, vertices: Float[np.ndarray, "V 3"]) -> Float64[np.ndarray, "3 3"]:
         """World from garment coordinates; `normals @ rotation` are normals in garment coordinates."""
-        return garment_rotation(self.mesh.vertices, vertices)
+        return garment_rotation(self.reference, vertices)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -27,7 +27,7 @@ from capture4d.errors import InputError
 from capture4d.mesh import vertex_normals
 from capture4d.tangents import TangentLayout, interpolated_frames, uv_corners
 from capture4d.types import Garment, Mesh
-from capture4d.uv_layout import pack_islands
+from capture4d.uv_layout import pack_islands, uv_area
 from capture4d.uv_raster import UvRaster, rasterise_uv, sample_bilinear
 
 __all__ = ["Anchors", "OffsetLayout", "OffsetSampler", "OffsetSpace", "decode", "encode"]
@@ -82,6 +82,8 @@ class OffsetLayout:
         mesh = garment.template
         if mesh.uv is None:
             raise InputError("template: expected UVs, found none; `capture4d template --uv fresh` cuts some")
+        if uv_area(mesh) <= 0:
+            raise InputError("template: expected UVs that spread the surface out, found none with any area")
         if garment.embedding_faces is None:
             raise InputError("template: expected a garment bound to a body, found none; run: capture4d template MESH")
         islands = TangentLayout(mesh.faces, mesh.uv).islands()

@@ -174,7 +174,9 @@ def _start_from_mean(network: nn.Module, train: OffsetFrames, drawn: Tensor | No
         if isinstance(network, ImageDecoder) and drawn is not None:
             network.mean.copy_(drawn.mean(dim=0, dtype=torch.float32))
         elif isinstance(network, FullyConnected):
-            network.layers[-1].bias.copy_(train.offsets.mean(dim=0).flatten())
+            last = network.layers[-1]
+            assert isinstance(last, nn.Linear)
+            last.bias.copy_(train.offsets.mean(dim=0).flatten())
 
 
 def train_offsets(
@@ -219,7 +221,7 @@ def train_offsets(
             optimizer.step()
         falling.step()
         errors.append(vertex_errors_cm(predict(network, sampler, validation), validation.vertices))
-        if errors[-1] < best:
+        if errors[-1] < best or not weights:
             best, weights = errors[-1], {name: value.clone() for name, value in network.state_dict().items()}
         if len(errors) - int(np.argmin(errors)) > config.patience:
             break

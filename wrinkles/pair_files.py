@@ -7,15 +7,20 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Bool
+from torch.nn import functional
 
+from capture4d.atomic_files import read_json
 from capture4d.errors import InputError
 from capture4d.records import load_garment
 from capture4d.types import Mesh
+from capture4d.uv_raster import rasterise_uv
 from capture4d.workdir import require_complete
+from wrinkles.config import MapConfig
 from wrinkles.map_spaces import decode_png
 from wrinkles.pairs import PairTake
 
-__all__ = ["layout_digest", "load_pairs", "pair_template", "read_map"]
+__all__ = ["layout_digest", "load_pairs", "map_settings", "pair_template", "read_map", "surface_texels"]
 
 
 def layout_digest(mesh: Mesh, size: int) -> str:
@@ -26,8 +31,25 @@ def layout_digest(mesh: Mesh, size: int) -> str:
 
 
 def pair_template(work: Path) -> Mesh:
-    """The template of a work folder's pairs, its UVs as the maps have them."""
+    """The template of a work folder's pairs: its UVs as the maps have them, its vertices as garment coordinates refer
+    to them."""
     return load_garment(work / "wrinkles" / "pairs" / "template.npz").template
+
+
+def map_settings(work: Path) -> MapConfig:
+    """How a work folder's pairs lie in their images."""
+    return MapConfig(**read_json(work / "wrinkles" / "pairs" / "stage.json")["config"]["map"])
+
+
+def surface_texels(mesh: Mesh, size: int, texels: int) -> Bool[torch.Tensor, "1 texels texels"]:
+    """Texels that show the surface itself, not the padding that repeats its border.
+
+    Args:
+        size, texels: sides of the maps on disk, and of those that are wanted.
+    """
+    raster = rasterise_uv(mesh, size, padding=0)
+    inside = torch.from_numpy(raster.image(raster.inside)).float()[None]
+    return functional.avg_pool2d(inside, size // texels) >= 0.5
 
 
 def load_pairs(work: Path) -> PairTake:
@@ -38,7 +60,7 @@ def load_pairs(work: Path) -> PairTake:
     """
     folder = work / "wrinkles" / "pairs"
     require_complete(folder, "pairs", f"capture4d wrinkles maps {work}")
-    paths = sorted((folder / "high").glob("*.png"))
+    paths = sorted(path for path in (folder / "high").glob("*.png") if path.stem.isdigit())
     low, high, valid = [], [], []
     for path in paths:
         lower, shown = read_map(folder / "low" / path.name)

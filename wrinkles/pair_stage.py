@@ -4,7 +4,7 @@ A garment that was animated has no scans. If it moves as a take did, its low map
 a network sees that is to work on the model's answers.
 
 stage.json            what was made
-template.npz          the garment, its UVs as the maps have them
+template.npz          the garment, its UVs as the maps have them, its vertices as garment coordinates refer to them
 low/000123.png        normals of the template, garment coordinates, 16 bit; alpha: the texel shows something
 high/000123.png       normals of the scan; alpha: they are known
 metrics/000123.json   share of the texels that are known, and the angle between the two
@@ -100,6 +100,7 @@ def _borrow(work: Path, lender: Path, config: PairConfig, *, overwrite: bool) ->
     lent = load_garment(pairs / "template.npz").template
     if layout_digest(lent, config.map.size) != layout_digest(template.mesh, config.map.size):
         raise InputError(f"{lender}: expected maps of the template and layout of {work}, found others")
+    template = template.referred_to(lent.vertices)
     rows = {int(frame_id): row for row, frame_id in enumerate(theirs.frame_ids)}
     shared = [(row, int(frame_id)) for row, frame_id in enumerate(sequence.frame_ids) if int(frame_id) in rows]
     if not shared:
@@ -110,7 +111,8 @@ def _borrow(work: Path, lender: Path, config: PairConfig, *, overwrite: bool) ->
         output, name="pairs", schema=SCHEMA, config=config, upstream=upstream, sources=sources, overwrite=overwrite
     )
     if not (output / "template.npz").is_file():
-        save_garment(output / "template.npz", replace(sequence.garment, template=template.mesh))
+        referred = template.mesh.with_vertices(template.reference)
+        save_garment(output / "template.npz", replace(sequence.garment, template=referred))
     pending = set(stage.pending([frame_id for _, frame_id in shared], ".png", folder="high"))
     shown = template.raster.image(np.ones(len(template.raster.inside), bool))
     for row, frame_id in shared:
@@ -135,7 +137,7 @@ def ensure_pairs(work: Path, config: PairConfig, *, workers: int = 1) -> None:
     record_path = work / "wrinkles" / "pairs" / "stage.json"
     record = read_json(record_path) if record_path.is_file() else {}
     finished = record.get("status") == "complete"
-    if not finished or record["upstream"].get("registration") != registered_digest(work):
+    if not finished or record.get("upstream", {}).get("registration") != registered_digest(work):
         run(work, config, workers=workers)
 
 

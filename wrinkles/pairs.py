@@ -14,7 +14,7 @@ from torch.nn import functional
 from capture4d.errors import InputError
 from wrinkles.config import AugmentationConfig
 
-__all__ = ["Batch", "PairTake", "augmented", "batches", "fitted", "halved", "split"]
+__all__ = ["Batch", "PairTake", "augmented", "batches", "consecutive_pairs", "fitted", "halved", "split"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,10 +56,13 @@ class Batch:
 
 
 def split(take: PairTake, *, held_out: float, gap: int) -> tuple[PairTake, PairTake]:
-    """The start of a take for training, and its end, some frames later, held out."""
+    """The start of a take for training, and its end, some frames later, held out.
+
+    A tenth of a short take is gap enough, but at least two frames are: high maps share the scans of their neighbours.
+    """
     count = len(take.frame_ids)
     tail = max(round(held_out * count), 1) if held_out > 0 else 0
-    gap = min(gap, count // 10) if tail else 0
+    gap = min(gap, max(count // 10, 2)) if tail else 0
     if count - tail - gap < 2:
         raise InputError(f"{take.name}: expected at least 2 frames to train on, found {count - tail - gap}")
     return take.part(range(count - tail - gap)), take.part(range(count - tail, count))
@@ -95,15 +98,25 @@ def _pooled(image: Tensor, known: Tensor) -> Tensor:
     return functional.normalize(mean, dim=1, eps=1e-6).half()
 
 
-def batches(takes: Sequence[PairTake], *, size: int, seed: int, start: int) -> Iterator[Batch]:
-    """Random consecutive pairs without end, each once an epoch; batch `start` is the first.
+def consecutive_pairs(takes: Sequence[PairTake]) -> list[tuple[int, int]]:
+    """Takes and positions in them of all frames that follow on another.
 
-    The same seed gives the same batches, wherever one starts.
+    Raises:
+        InputError: there are none.
     """
     pairs = [(index, int(at)) for index, take in enumerate(takes) for at in take.consecutive()]
     if not pairs:
         raise InputError(f"{', '.join(take.name for take in takes)}: expected consecutive frames with known texels, "
                          "found none")  # fmt: skip
+    return pairs
+
+
+def batches(takes: Sequence[PairTake], *, size: int, seed: int, start: int) -> Iterator[Batch]:
+    """Random consecutive pairs without end, each once an epoch; batch `start` is the first.
+
+    The same seed gives the same batches, wherever one starts.
+    """
+    pairs = consecutive_pairs(takes)
     position = start * size
     while True:
         chosen = [pairs[_shuffled(len(pairs), seed, (position + i) // len(pairs))[(position + i) % len(pairs)]]

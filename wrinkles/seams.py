@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, Int64
 from scipy.spatial import KDTree
 
+from capture4d.tangents import TangentLayout
 from capture4d.types import Mesh
 from capture4d.uv_raster import UvRaster, sample_bilinear
 
@@ -39,43 +40,48 @@ class SeamTable:
 
 
 def seam_table(mesh: Mesh, raster: UvRaster, *, reach: float = 6.0) -> SeamTable:
-    """Find the texels within `reach` texels of a seam, padding included."""
+    """Find the texels within `reach` texels of a seam of their own island, padding included."""
     assert mesh.uv is not None
-    own, other = _seam_points(mesh, raster.size)
-    row, column = np.divmod(raster.texels, raster.size)
-    centres = np.column_stack([column + 0.5, raster.size - row - 0.5]) / raster.size
-    if not len(own):
-        none = np.zeros((0, 2))
-        return SeamTable(np.zeros(0, np.int64), none[:, 0], none, none)
-    distance, nearest = (
-        np.asarray(each) for each in KDTree(own).query(centres, distance_upper_bound=reach / raster.size)
-    )
-    near = np.flatnonzero(np.isfinite(distance))
-    weight = 1 - distance[near] * raster.size / reach
-    # Padding repeats the border, so it is moved as far as the border is.
-    weight[~raster.inside[near]] = 1.0
-    return SeamTable(near, weight, own[nearest[near]], other[nearest[near]])
+    islands = TangentLayout(mesh.faces, mesh.uv).islands()
+    own, other, island = _seam_points(mesh, islands, raster.size)
+    # Padding repeats the border, so it is moved as far as the border is: it counts as lying there.
+    places = raster.at_corners(mesh.uv)
+    at = islands[raster.faces]
+    near, weight, points = [np.zeros(0, np.int64)], [np.zeros(0)], [np.zeros(0, np.int64)]
+    for number in np.unique(island):
+        texels, mine = np.flatnonzero(at == number), np.flatnonzero(island == number)
+        tree = KDTree(own[mine])
+        distance, nearest = map(np.asarray, tree.query(places[texels], distance_upper_bound=reach / raster.size))
+        found = np.isfinite(distance)
+        near.append(texels[found])
+        weight.append(1 - distance[found] * raster.size / reach)
+        points.append(mine[nearest[found]])
+    at_seam = np.concatenate(points)
+    return SeamTable(np.concatenate(near), np.concatenate(weight), own[at_seam], other[at_seam])
 
 
-def _seam_points(mesh: Mesh, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """UVs of points along all seams, twice each: from one side and from the other; one a quarter texel."""
+def _seam_points(mesh: Mesh, islands: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """UVs of points along all seams, twice each: from one side and from the other; one a quarter texel. The island of
+    the first."""
     assert mesh.uv is not None
-    sides: dict[tuple[int, int], list[np.ndarray]] = {}
+    sides: dict[tuple[int, int], list[tuple[np.ndarray, int]]] = {}
     for corner in range(3):
         onward = (corner + 1) % 3
         start, end = mesh.faces[:, corner], mesh.faces[:, onward]
         uv = np.stack([mesh.uv[:, corner], mesh.uv[:, onward]], axis=1).astype(float)
         swap = start > end
         uv[swap] = uv[swap, ::-1]
-        for a, b, place in zip(np.minimum(start, end).tolist(), np.maximum(start, end).tolist(), uv, strict=True):
-            sides.setdefault((a, b), []).append(place)
-    own, other = [np.zeros((0, 2))], [np.zeros((0, 2))]
+        keys = zip(np.minimum(start, end).tolist(), np.maximum(start, end).tolist(), strict=True)
+        for key, place, island in zip(keys, uv, islands.tolist(), strict=True):
+            sides.setdefault(key, []).append((place, island))
+    own, other, at = [np.zeros((0, 2))], [np.zeros((0, 2))], [np.zeros(0, np.int64)]
     for pair in sides.values():
-        if len(pair) != 2 or np.array_equal(pair[0], pair[1]):
+        if len(pair) != 2 or np.array_equal(pair[0][0], pair[1][0]):
             continue
-        length = size * max(np.linalg.norm(side[1] - side[0]) for side in pair)
+        length = size * max(np.linalg.norm(side[1] - side[0]) for side, _ in pair)
         t = np.linspace(0, 1, max(int(np.ceil(4 * length)), 1) + 1)[:, None]
-        first, second = (side[0] + t * (side[1] - side[0]) for side in pair)
+        first, second = (side[0] + t * (side[1] - side[0]) for side, _ in pair)
         own += [first, second]
         other += [second, first]
-    return np.concatenate(own), np.concatenate(other)
+        at += [np.full(len(t), island) for _, island in pair]
+    return np.concatenate(own), np.concatenate(other), np.concatenate(at)

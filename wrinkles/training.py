@@ -124,8 +124,11 @@ def load_tensors(state: TrainingState, tensors: Mapping[str, Tensor], *, source:
     """Go on from a checkpoint.
 
     Raises:
-        InputError: `source` holds another architecture.
+        InputError: `source` holds another architecture, or is not whole.
     """
+    for needed in ("step", "random"):
+        if needed not in tensors:
+            raise InputError(f"{source}: expected a whole checkpoint, found one without '{needed}'")
     for name, network, optimizer in _parts(state):
         weights = {key.removeprefix(f"{name}."): value for key, value in tensors.items() if key.startswith(f"{name}.")}
         load_weights(network, weights, source=source)
@@ -134,6 +137,11 @@ def load_tensors(state: TrainingState, tensors: Mapping[str, Tensor], *, source:
             if key.startswith(f"{name}_optimizer."):
                 _, index, entry = key.split(".")
                 moments.setdefault(int(index), {})[entry] = value
+        for index, parameter in enumerate(optimizer.param_groups[0]["params"]):
+            for entry, value in moments.get(index, {}).items():
+                if entry != "step" and value.shape != parameter.shape:
+                    raise InputError(f"{source}: '{name}_optimizer.{index}.{entry}': expected "
+                                     f"{tuple(parameter.shape)}, found {tuple(value.shape)}")  # fmt: skip
         optimizer.load_state_dict({"state": moments, "param_groups": optimizer.state_dict()["param_groups"]})
     state.step = int(tensors["step"])
     torch.set_rng_state(tensors["random"])

@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import jinja2
@@ -29,17 +29,18 @@ from capture4d.app.compare_garment import Modelled, model_take
 from capture4d.app.render import Drawn, heat_colours, render
 from capture4d.app.report_pictures import CLOTH, HEIGHT, SKIN, WIDTH, Framing, Panel, colour_bar, data_uri, write_panel
 from capture4d.atomic_files import file_digest, read_json, write_bytes, write_json
-from capture4d.body_stage import load_tracking
+from capture4d.body import with_shape
 from capture4d.errors import InputError
 from capture4d.evaluation import correspondence_errors, material_points
-from capture4d.scans import Capture, read_body, read_poses, read_scan, read_truth_model, read_truth_vertices
+from capture4d.scans import Capture, read_scan, read_truth_model, read_truth_vertices
 from capture4d.types import Body, PoseSequence, RegisteredSequence
 from capture4d.uv_layout import millimetres_per_texel
-from capture4d.work_folder import load_registration, registered_digest, work_capture
-from capture4d.workdir import open_stage
-from retarget.stage import GarmentModel, load_garment_model
+from capture4d.work_folder import failed_frames, find_moving_body, load_registration, registered_digest, work_capture
+from capture4d.workdir import open_stage, require_complete
+from retarget.pose_normalisation import PoseRows
+from retarget.stage import GarmentModel, learned_frames, load_garment_model
 from wrinkles.apply_stage import generated_normals
-from wrinkles.config import MapConfig, PairConfig
+from wrinkles.config import PairConfig
 from wrinkles.display import fill_holes
 from wrinkles.inference import load_model
 from wrinkles.map_metrics import angles, score
@@ -48,14 +49,14 @@ from wrinkles.normal_maps import MapTemplate
 from wrinkles.offset_images import OffsetLayout, OffsetSampler
 from wrinkles.offset_networks import ImageDecoder, PcaFullyConnected
 from wrinkles.offset_training import OffsetConfig, OffsetFrames, offset_frames, pose_joints, predict, train_offsets
-from wrinkles.pair_files import layout_digest, load_pairs
+from wrinkles.pair_files import layout_digest, load_pairs, pair_template
 from wrinkles.pair_stage import ensure_pairs
 from wrinkles.pairs import PairTake, split
 from wrinkles.seams import seam_table
 
 __all__ = ["run"]
 
-SCHEMA = 2
+SCHEMA = 3
 ERROR_DEG = 30.0
 """Normal error at which the strip's colours saturate."""
 MB = 1e6
@@ -73,6 +74,8 @@ class _Method:
     ms_per_frame: float
     megabytes: float
     has_map: bool = False
+    learned: bool = False
+    """From some of these frames."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,6 +87,8 @@ class _Row:
     flicker_deg: float | None
     ms_per_frame: float
     model_mb: float
+    learned: bool
+    """From some of these very frames: then it shows what the model holds, not what it foresees."""
 
 
 def run(
@@ -101,13 +106,19 @@ def run(
         model: folder of `capture4d wrinkles train`.
         garment_model: what `capture4d fit` wrote; WORK/retarget, if there is one, by default.
     Raises:
-        InputError: the work folder lacks registration or scans, or a model is of another template.
+        InputError: the work folder lacks registration or scans, a model is of another template, or the network learned
+            from all frames.
     """
+    _check(config)
     weights = model / "generator.safetensors" if model.is_dir() else model
     generator = load_model(weights)
-    ensure_pairs(work, PairConfig(map=MapConfig(size=generator.map_size)), workers=workers)
+    ensure_pairs(work, PairConfig(map=generator.maps), workers=workers)
     known = _garment_model(work, garment_model)
-    upstream = {"registration": registered_digest(work), "model": file_digest([weights], root=weights.parent)}
+    upstream = {
+        "registration": registered_digest(work),
+        "pairs": require_complete(work / "wrinkles" / "pairs", "pairs", f"capture4d wrinkles maps {work}"),
+        "model": file_digest([weights], root=weights.parent),
+    }
     if known is not None:
         upstream["garment model"] = known.digest
     stage = open_stage(
@@ -119,39 +130,41 @@ def run(
         return page_path
     torch.set_num_threads(workers)
     capture, sequence = work_capture(work), load_registration(work / "registration")
-    template = MapTemplate.create(sequence.garment, MapConfig(size=generator.map_size))
-    if layout_digest(template.mesh, generator.map_size) != generator.layout_digest:
+    template = MapTemplate.create(sequence.garment, generator.maps).referred_to(pair_template(work).vertices)
+    if layout_digest(template.mesh, generator.maps.size) != generator.layout_digest:
         raise InputError(f"{work}: expected the template that {weights} was trained on, found another")
     pairs = load_pairs(work)
-    if pairs.low.shape[-1] != generator.map_size:
-        raise InputError(f"{work}: expected pairs of {generator.map_size} texels, as {weights} has them, found "
+    if pairs.low.shape[-1] != generator.maps.size:
+        raise InputError(f"{work}: expected pairs of {generator.maps.size} texels, as {weights} has them, found "
                          f"{pairs.low.shape[-1]}")  # fmt: skip
-    held_out, gap = _model_split(model, work, config)
+    held_out, gap = _network_split(weights, work, upstream["pairs"], config)
     learned, held = split(pairs, held_out=held_out, gap=gap)
-    first = len(pairs.frame_ids) - len(held.frame_ids)
-    rows = range(first, len(pairs.frame_ids))
+    rows = _rows(sequence, held.frame_ids, work)
     methods = [_registered(template, sequence, rows)]
-    moving = _moving(work, capture)
+    moving = find_moving_body(work)
     modelled: Modelled | None = None
     if known is not None and moving is not None:
         modelled = model_take(known, sequence, *moving, rows)
+        seen = any(not set(rows).isdisjoint(part) for part in learned_frames(known.folder, upstream["registration"]))
         methods += [
             _drawn_by(
                 each.name, template, each.vertices, template.low_normals, each.megabytes,
-                extra_ms=each.ms_per_frame, has_map=False,
+                extra_ms=each.ms_per_frame, has_map=False, learned=seen,
             )
             for each in modelled.surfaces
         ]  # fmt: skip
-    seams = seam_table(template.mesh, template.raster)
+    seams, its_own = seam_table(template.mesh, template.raster), template.referred_to(generator.reference)
     methods.append(
         _drawn_by(
             "network", template, methods[0].vertices,
-            lambda vertices: generated_normals(generator, template, seams, vertices),
+            lambda vertices: generated_normals(generator, its_own, seams, vertices),
             _megabytes(generator.generator),
         )
     )  # fmt: skip
     if moving is not None and sequence.garment.skin_weights is not None:
-        methods += _offset_methods(template, sequence, *moving, rows, len(learned.frame_ids), config)
+        failed = failed_frames(work)
+        sound = [frame_id for frame_id in learned.frame_ids.tolist() if frame_id not in failed]
+        methods += _offset_methods(template, sequence, *moving, rows, _rows(sequence, sound, work), config)
     truth = _true_vertices(capture, held.frame_ids)
     table = [_measure(method, template, held, truth, methods[0]) for method in methods]
     chosen = np.unique(np.linspace(0, len(held.frame_ids) - 1, min(config.pictures, len(rows))).astype(int))
@@ -225,18 +238,45 @@ def _garment_model(work: Path, path: Path | None) -> GarmentModel | None:
     return load_garment_model(work if path is None else path)
 
 
-def _model_split(model: Path, work: Path, config: CompareConfig) -> tuple[float, int]:
-    """The frames a network has not seen: its own split where it learned from this take."""
-    record_path = model / "stage.json"
+def _check(config: CompareConfig) -> None:
+    for name, value in (("pictures", config.pictures), ("epochs", config.epochs)):
+        if value < 1:
+            raise InputError(f"{name}: expected at least 1, found {value}")
+    if not 0 < config.held_out < 1:
+        raise InputError(f"held_out: expected a share between 0 and 1, found {config.held_out:g}")
+    if config.image_texels < 16 or config.image_texels & (config.image_texels - 1):
+        raise InputError(f"image_texels: expected a power of two from 16 on, found {config.image_texels}")
+
+
+def _network_split(weights: Path, work: Path, pairs: str, config: CompareConfig) -> tuple[float, int]:
+    """The frames a network has not seen: its own split where it learned from this take.
+
+    Args:
+        pairs: digest of the take's pairs.
+    """
+    record_path = weights.parent / "stage.json"
     record = read_json(record_path) if record_path.is_file() else {}
-    learned = record.get("config", {})
-    if work.name in record.get("upstream", {}) and learned.get("held_out", 0) > 0:
-        return float(learned["held_out"]), int(learned["held_out_gap"])
+    settings, takes = record.get("config", {}), record.get("upstream", {})
+    if settings.get("held_out", 0) > 0 and (pairs in takes.values() or work.resolve().name in takes):
+        return float(settings["held_out"]), int(settings["held_out_gap"])
+    if pairs in takes.values():
+        raise InputError(f"{weights}: expected a network that has not seen all frames of {work}, found one that "
+                         "learned from it without held-out frames")  # fmt: skip
     return config.held_out, config.gap
 
 
-def _registered(template: MapTemplate, sequence: RegisteredSequence, rows: range) -> _Method:
-    vertices = np.array(sequence.vertices[rows.start : rows.stop])
+def _rows(sequence: RegisteredSequence, frame_ids: Sequence[int] | np.ndarray, work: Path) -> list[int]:
+    """Where frames lie in the registered sequence."""
+    rows = {frame_id: row for row, frame_id in enumerate(sequence.frame_ids.tolist())}
+    for frame_id in frame_ids:
+        if int(frame_id) not in rows:
+            raise InputError(f"{work}: frame {frame_id}: expected it among the registered frames, as it has a pair of "
+                             "maps, found none")  # fmt: skip
+    return [rows[int(frame_id)] for frame_id in frame_ids]
+
+
+def _registered(template: MapTemplate, sequence: RegisteredSequence, rows: Sequence[int]) -> _Method:
+    vertices = np.array(sequence.vertices[list(rows)])
     return _drawn_by("registration", template, vertices, template.low_normals, 0.0, has_map=False)
 
 
@@ -249,21 +289,14 @@ def _drawn_by(
     *,
     extra_ms: float = 0.0,
     has_map: bool = True,
+    learned: bool = False,
 ) -> _Method:
     maps, times = [], []
     for placed in vertices:
         begin = time.perf_counter()
         maps.append(normals(placed))
         times.append(1e3 * (time.perf_counter() - begin))
-    return _Method(name, vertices, np.stack(maps), float(np.median(times)) + extra_ms, megabytes, has_map)
-
-
-def _moving(work: Path, capture: Capture) -> tuple[Body, PoseSequence] | None:
-    """The body and its poses, tracked or brought along."""
-    if (work / "body" / "poses.npz").is_file():
-        return load_tracking(work / "body")
-    body, poses = read_body(capture), read_poses(capture)
-    return None if body is None or poses is None else (body, poses)
+    return _Method(name, vertices, np.stack(maps), float(np.median(times)) + extra_ms, megabytes, has_map, learned)
 
 
 def _offset_methods(
@@ -271,25 +304,25 @@ def _offset_methods(
     sequence: RegisteredSequence,
     body: Body,
     poses: PoseSequence,
-    rows: range,
-    learned: int,
+    rows: Sequence[int],
+    learned: Sequence[int],
     config: CompareConfig,
 ) -> list[_Method]:
-    """Learn decoder and baseline on the first frames, and predict the held-out ones."""
+    """Learn decoder and baseline on some frames, of which the last ninth stops them, and predict the held-out ones.
+
+    Raises:
+        InputError: there are not two frames to learn from.
+    """
+    if len(learned) < 2:
+        raise InputError(f"compare: expected at least 2 soundly registered frames to learn from, found {len(learned)}")
     garment, size = sequence.garment, config.image_texels
     assert garment.skin_weights is not None
-    order = [poses.frame_ids.tolist().index(frame_id) for frame_id in sequence.frame_ids.tolist()]
-    ordered = replace(
-        poses,
-        rotations=poses.rotations[order],
-        translations=poses.translations[order],
-        frame_ids=poses.frame_ids[order],
-    )
+    ordered = PoseRows.match(sequence, with_shape(body, poses.shape), poses).poses
     joints = pose_joints(ordered, garment.skin_weights)
     layout = OffsetLayout.create(garment, size)
     frames = offset_frames(layout, body, ordered, np.array(sequence.vertices), joints)
-    training, cut = frames.rows(range(learned)), max(learned // 9, 1)
-    parts = training.rows(range(max(learned - cut, 1))), training.rows(range(learned - cut, learned))
+    cut = len(learned) - max(len(learned) // 9, 1)
+    parts = frames.rows(list(learned[:cut])), frames.rows(list(learned[cut:]))
     held, sampler = frames.rows(list(rows)), OffsetSampler(layout)
     torch.manual_seed(0)
     channels = max(size * 3 // 2, 2 ** (size.bit_length() - 4))
@@ -349,8 +382,8 @@ def _measure(
     consecutive = torch.zeros(len(maps), dtype=torch.bool)
     consecutive[torch.from_numpy(held.consecutive())] = True
     scores = score(
-        maps, held.high.float(), held.valid, mm_per_texel=millimetres_per_texel(template.mesh, raster.size),
-        consecutive=consecutive,
+        maps, held.high.float(), held.valid & torch.from_numpy(raster.image(raster.inside)),
+        mm_per_texel=millimetres_per_texel(template.mesh, raster.size), consecutive=consecutive,
     )  # fmt: skip
     reference = truth if truth is not None else None if method is registered else registered.vertices
     errors = [] if reference is None else [
@@ -359,6 +392,7 @@ def _measure(
     return _Row(
         method.name, _number(1e3 * float(np.mean(errors))) if errors else None, _number(scores.normal_error_deg),
         _number(scores.wrinkle_energy_kept), _number(scores.flicker_deg), method.ms_per_frame, method.megabytes,
+        method.learned,
     )  # fmt: skip
 
 

@@ -79,7 +79,7 @@ class Modelled:
 
 
 def model_take(
-    known: GarmentModel, sequence: RegisteredSequence, body: Body, poses: PoseSequence, rows: range
+    known: GarmentModel, sequence: RegisteredSequence, body: Body, poses: PoseSequence, rows: Sequence[int]
 ) -> Modelled:
     """Blendshapes: the registered frames, projected on the model's directions. Regression: the garment from the poses
     alone.
@@ -106,11 +106,14 @@ def model_take(
     coefficients = np.zeros((0, 0), np.float32)
     for name, regressor in known.regressors.items():
         controls = control_vectors(regressor.layout, matched.poses)
-        begin = time.perf_counter()
-        coefficients = regressor.predict(controls)
-        ms = 1e3 * (time.perf_counter() - begin) / len(controls)
+        stream, said, times = regressor.stream(), [], []
+        for each in controls:
+            begin = time.perf_counter()
+            said.append(stream.push(each))
+            times.append(1e3 * (time.perf_counter() - begin))
+        coefficients, ms = np.stack(said), float(np.median(times))
         size = (known.folder / f"{name}.safetensors").stat().st_size
-        answers[f"regression, {_IN_WORDS[name]}"] = coefficients[rows.start : rows.stop], ms, size
+        answers[f"regression, {_IN_WORDS[name]}"] = coefficients[list(rows)], ms, size
     mean = retargeted_mean(model, person, matched.shaped).astype(np.float32)  # on the person as this take was tracked
     surfaces = []
     for name, (wanted, extra_ms, size) in answers.items():

@@ -5,7 +5,6 @@ Each section is a value for the page's template, or None where the stage was not
 
 from __future__ import annotations
 
-import json
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -22,7 +21,7 @@ from capture4d.app.charts import Line, line_chart
 from capture4d.app.render import Drawn, render
 from capture4d.app.report_metrics import column
 from capture4d.app.report_pictures import VIEWS, Framing, Panel, data_uri, no_scan, read_panel, readable_scan
-from capture4d.atomic_files import read_json
+from capture4d.atomic_files import read_json, read_json_lines
 from capture4d.body import pose_frame, with_shape
 from capture4d.body_stage import load_tracking
 from capture4d.errors import InputError
@@ -164,7 +163,7 @@ def tracking(capture: Capture, work: Path) -> Tracking | None:
     folder = work / "body"
     if not (folder / "metrics.jsonl").is_file():
         return None
-    records = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    records = read_json_lines(folder / "metrics.jsonl")
     truth = capture.path / "truth" / "poses.npz"
     if truth.is_file():
         _measure_joints(folder, load_poses(truth), records)

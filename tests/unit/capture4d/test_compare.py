@@ -1,6 +1,7 @@
-"""The comparison on a sleeve with a body inside: one row a surface, one page, nothing learned from held-out frames."""
+"""The comparison on a sleeve with a body inside: one row a surface, one page, and it is said what had been learned."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -63,8 +64,9 @@ def test_every_surface_has_a_row(compared: Path):
     assert result["frames"] == [7, 8]
     assert 4 < rows["registration"]["normal_deg"] < 12
     assert rows["registration"]["vertex_mm"] is None
-    assert rows["network"]["vertex_mm"] == 0
     assert rows["network"]["model_mb"] > 0
+    # the garment model was fitted to all eight frames
+    assert [name for name, row in rows.items() if row["learned"]] == ["blendshapes", "regression, linear"]
     # the wobble is one direction, and no pose tells of it
     assert rows["blendshapes"]["vertex_mm"] < 1e-3
     assert 0.2 < rows["regression, linear"]["vertex_mm"] < 2
@@ -75,25 +77,56 @@ def test_every_surface_has_a_row(compared: Path):
 
 def test_the_page_stands_alone_and_shows_all(compared: Path):
     page = (compared / "index.html").read_text()
+    assert page.count("regression, linear *") == 1
+    assert "learned from these very frames" in page
     assert "http" not in page.replace("https://www.w3.org", "")
     assert page.count("<figure>") == 2 * (9 + 6) + 5
     for name in ("scan", "network", "offset images", "map of the scan"):
         assert f"<figcaption>{name}</figcaption>" in page
 
 
+def again(compared: Path, model: Path, *more: str) -> int:
+    command = ["compare", compared.parent, "--model", model, "--image-texels", "32", "--epochs", "2", "--workers", "1"]
+    with pytest.raises(SystemExit) as exit_:
+        main([str(argument) for argument in (*command, *more)])
+    return int(exit_.value.code or 0)
+
+
 def test_a_comparison_is_made_once(compared: Path):
     before = (compared / "index.html").stat().st_mtime_ns
-    again = [
-        "compare",
-        compared.parent,
-        "--model",
-        compared.parents[1] / "model",
-        "--image-texels",
-        "32",
-        "--epochs",
-        "2",
-    ]
-    with pytest.raises(SystemExit) as exit_:
-        main([str(argument) for argument in (*again, "--workers", "1")])
-    assert not exit_.value.code
+    assert again(compared, compared.parents[1] / "model") == 0
     assert (compared / "index.html").stat().st_mtime_ns == before
+
+
+def test_a_network_s_file_stands_for_its_folder(compared: Path):
+    """Its split is found beside the file."""
+    before = (compared / "index.html").stat().st_mtime_ns
+    assert again(compared, compared.parents[1] / "model" / "generator.safetensors") == 0
+    assert (compared / "index.html").stat().st_mtime_ns == before
+
+
+def test_a_network_that_has_seen_everything_is_refused(
+    compared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    model = tmp_path / "model"
+    shutil.copytree(compared.parents[1] / "model", model)
+    record = json.loads((model / "stage.json").read_text())
+    record["config"]["held_out"] = 0.0
+    (model / "stage.json").write_text(json.dumps(record))
+    work = tmp_path / "work"
+    shutil.copytree(compared.parent, work, ignore=shutil.ignore_patterns("compare"))
+    assert again(work / "compare", model) == 1
+    assert "learned from it without held-out frames" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "said"),
+    [
+        ("--image-texels", "100", "power of two"),
+        ("--epochs", "0", "at least 1"),
+        ("--held-out", "0", "between 0 and 1"),
+    ],
+)
+def test_settings_out_of_range(compared: Path, capsys: pytest.CaptureFixture[str], option: str, value: str, said: str):
+    assert again(compared, compared.parents[1] / "model", option, value) == 1
+    assert said in capsys.readouterr().err

@@ -1,10 +1,12 @@
 """Maps on disk, across seams and with holes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from capture4d.errors import InputError
-from capture4d.types import Garment
+from capture4d.types import Garment, Mesh
 from wrinkles.config import MapConfig
 from wrinkles.display import fill_holes
 from wrinkles.map_spaces import decode_png, encode_png, flip_green
@@ -62,6 +64,26 @@ def test_a_step_at_a_seam_vanishes_and_continuous_maps_stay(garment: Garment):
 
     height = template.raster.image(points[:, 1:2].astype(np.float32))
     np.testing.assert_allclose(table.blended(height, template.raster), height, atol=2e-3)
+
+
+def test_a_seam_moves_nothing_on_an_island_beside_it(garment: Garment):
+    """The first panel's hem, an open edge, lies two texels above a seam of the second."""
+    mesh = garment.template
+    assert mesh.uv is not None
+    second = mesh.uv[..., 0].mean(axis=1, keepdims=True) > 0.35
+    u, v = 0.9 * mesh.uv[..., 0], 0.9 * mesh.uv[..., 1]
+    beside = np.stack([0.02 + v, 0.5 - 2.5 / 128 - (u - 0.9 * (0.1 * np.pi + 0.1))], axis=-1)  # turned by 90 degrees
+    uv = np.where(second[..., None], beside, np.stack([0.02 + u, 0.5 + v], axis=-1)).astype(np.float32)
+    template = MapTemplate.create(replace(garment, template=Mesh(mesh.vertices, mesh.faces, uv)), MapConfig(size=128))
+    table = seam_table(template.mesh, template.raster)
+    island = template.tangents.islands()[template.raster.faces]
+    first = ~second.ravel()[template.raster.faces]
+    assert len(np.unique(island[first])) == 1
+    points = template.raster.at_vertices(mesh.vertices.astype(float))
+    hem = first & (points[:, 1] < 0.03) & (np.abs(points[:, 0]) > 0.08)
+    assert hem.sum() > 50
+    step = template.raster.image(np.where(first, 1.0, 0.0)[:, None].astype(np.float32))
+    np.testing.assert_array_equal(template.raster.read(table.blended(step, template.raster))[hem], 1)
 
 
 def test_holes_are_filled_from_around_and_nothing_else_changes():

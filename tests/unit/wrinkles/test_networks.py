@@ -2,10 +2,11 @@
 
 from typing import Literal
 
+import numpy as np
 import pytest
 import torch
 
-from wrinkles.config import PRESETS, NetworkConfig
+from wrinkles.config import PRESETS, MapConfig, NetworkConfig
 from wrinkles.inference import WrinkleModel
 from wrinkles.networks import PatchDiscriminator, UNet, receptive_field, set_test_statistics
 
@@ -82,7 +83,8 @@ def test_instance_statistics_leave_no_trace_and_running_ones_do_not_look_at_the_
 def test_half_precision_changes_a_map_by_less_than_half_a_degree(output: Literal["residual", "absolute"]):
     torch.manual_seed(0)
     config = NetworkConfig(filters=32, layers=4, output=output, dropout=0.0)
-    model = WrinkleModel(UNet(config), config, texels=32, map_size=32, layout_digest="")
+    model = WrinkleModel(UNet(config), config, texels=32, maps=MapConfig(size=32), layout_digest="",
+                         reference=np.zeros((1, 3), np.float32))  # fmt: skip
     low = torch.nn.functional.normalize(torch.randn(3, 32, 32), dim=0)
     low[:, :5] = 0
     full, half = (model.generate(low, half_precision=each) for each in (False, True))

@@ -12,6 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import safetensors.torch
+import torch
 from scipy.spatial.transform import Rotation
 
 from capture4d.app.cli import main
@@ -114,9 +116,12 @@ TURN = Rotation.from_euler("xyz", [5, 20, 10], degrees=True).as_matrix()
 
 
 def turned_copy(work: Path, folder: Path, frame_ids: list[int]) -> Path:
-    """The garment as a bad model has it, turned, in some of the frames; no scans: as an animation is."""
+    """The garment as a bad model has it, turned, in some of the frames; no scans: as an animation is. Its template is a
+    learned mean, which lies a bit otherwise than the take's."""
     garment = load_garment(work / "registration" / "garment.npz")
     vertices = (garment.template.vertices @ TURN.T + [0, 0.01, 0]).astype(np.float32)
+    at_rest = garment.template.vertices @ Rotation.from_euler("z", 3, degrees=True).as_matrix()
+    garment = replace(garment, template=garment.template.with_vertices(at_rest.astype(np.float32)))
     placed = open_stage(folder / "registration", name="animate", schema=1, config=None, upstream={})
     save_garment(placed.path / "garment.npz", garment)
     for frame_id in frame_ids:
@@ -192,9 +197,38 @@ def test_green_is_flipped_on_demand_and_delivery_is_8_bit(work: Path, trained: P
     assert np.abs(pixels[..., ::-1] / 127.5 - 1 - up).max() < 0.01
 
 
+def test_maps_of_an_animation_do_not_hang_on_its_template(work: Path, trained: Path, tmp_path: Path):
+    """What the network sees refers to the template it was trained on."""
+    animated = turned_copy(work, tmp_path / "animated", [1])
+    again = turned_copy(work, tmp_path / "again", [1])
+    garment = load_garment(work / "registration" / "garment.npz")
+    save_garment(again / "registration" / "garment.npz", garment)
+    for folder in (animated, again):
+        assert run("wrinkles", "apply", trained, folder, "--workers", "1") == 0
+    found, wanted = (
+        decode_png((folder / "wrinkles" / "generated" / "frames" / "000001.png").read_bytes(), source="")[0]
+        for folder in (animated, again)
+    )
+    np.testing.assert_allclose(found, wanted, atol=1e-3)
+
+
+def test_a_model_keeps_the_layout_of_its_maps(work: Path, tmp_path: Path):
+    """Islands that were packed with another padding lie elsewhere."""
+    model = tmp_path / "padded"
+    assert run(*train(work, model, "--pairs.map.padding", "6", "--schedule.steps", "2")) == 0
+    assert run("wrinkles", "apply", model, work, "--workers", "1") == 0
+    made = load_garment(work / "wrinkles" / "generated" / "template.npz").template
+    np.testing.assert_array_equal(made.uv, load_garment(work / "wrinkles" / "pairs" / "template.npz").template.uv)
+
+
+@pytest.mark.parametrize("log_every", [2, 3])
 def test_an_interrupted_training_ends_with_the_same_weights(
-    work: Path, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    work: Path, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, log_every: int
 ):
+    if log_every != 2:  # a line of the log spans a checkpoint
+        assert run(*train(work, tmp_path / "whole", "--schedule.log-every", "3")) == 0
+        trained = tmp_path / "whole"
+    more = ("--schedule.log-every", str(log_every))
     step, done = train_stage.train_step, []
 
     def stopping(*arguments: object) -> dict[str, float]:
@@ -204,9 +238,9 @@ def test_an_interrupted_training_ends_with_the_same_weights(
         return step(*arguments)  # pyright: ignore
 
     monkeypatch.setattr(train_stage, "train_step", stopping)
-    assert run(*train(work, tmp_path / "again")) == 130
+    assert run(*train(work, tmp_path / "again", *more)) == 130
     monkeypatch.setattr(train_stage, "train_step", step)
-    assert run(*train(work, tmp_path / "again")) == 0
+    assert run(*train(work, tmp_path / "again", *more)) == 0
     for name in ("generator.safetensors", "checkpoints/000006.safetensors", "metrics.jsonl", "samples/000006.png"):
         assert (tmp_path / "again" / name).read_bytes() == (trained / name).read_bytes(), name
 
@@ -245,6 +279,52 @@ def test_a_checkpoint_of_another_architecture(
     assert "no such file" in fails(capsys, "wrinkles", "apply", tmp_path / "nowhere", work)
 
 
+def test_the_newest_checkpoint_is_the_one_with_the_most_steps(work: Path, trained: Path):
+    """Past a million steps names are longer, and text sorts them wrongly."""
+    folder = trained / "checkpoints"
+    (folder / "000006.safetensors").rename(folder / "1000000.safetensors")
+    (folder / "000004.safetensors").rename(folder / "999500.safetensors")
+    (folder / "999500.safetensors").write_bytes(b"damaged")
+    assert run(*train(work, trained)) == 0
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (("--texels", "24"), "expected maps of 24 texels times a power of two, found 64"),
+        (("--schedule.log-every", "0"), "schedule.log_every: expected at least 1, found 0"),
+        (("--network.layers", "9"), "network.layers: expected at most 5"),
+        (("--held-out", "1"), "held_out: expected a share from 0 to below 1, found 1"),
+    ],
+)
+def test_settings_out_of_range_leave_nothing_behind(
+    work: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], wrong: tuple[str, str], said: str
+):
+    assert said in fails(capsys, *train(work, tmp_path / "model", *wrong))
+    assert not (tmp_path / "model" / "stage.json").exists()
+
+
+def test_damaged_notes_are_named(work: Path, trained: Path, capsys: pytest.CaptureFixture[str]):
+    (trained / "metrics.jsonl").write_text('{"step": 2}\n{"step"')
+    assert "metrics.jsonl: line 2: not valid JSON" in fails(capsys, *train(work, trained))
+    (work / "registration" / "metrics.jsonl").write_text("[1]\n")
+    line = fails(capsys, "wrinkles", "maps", work, "--map.size", "32", "--overwrite", "--workers", "1")
+    assert "metrics.jsonl: line 1: expected a JSON object, found list" in line
+
+
+def test_a_checkpoint_that_is_not_whole(work: Path, trained: Path, capsys: pytest.CaptureFixture[str]):
+    path = trained / "checkpoints" / "000006.safetensors"
+    tensors = safetensors.torch.load(path.read_bytes())
+    moment = "generator_optimizer.0.exp_avg"
+    for name, change, said in (
+        ("random", {}, "expected a whole checkpoint, found one without 'random'"),
+        (moment, {moment: torch.zeros(3)}, f"'{moment}': expected"),
+    ):
+        kept = {key: value for key, value in tensors.items() if key != name}
+        path.write_bytes(safetensors.torch.save(kept | change))
+        assert said in fails(capsys, *train(work, trained))
+
+
 def test_a_mask_of_another_size(work: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert run("wrinkles", "maps", work, "--map.size", "64", "--workers", "1") == 0
     path = work / "wrinkles" / "pairs" / "high" / "000002.png"
@@ -259,9 +339,10 @@ def test_a_mask_of_another_size(work: Path, tmp_path: Path, capsys: pytest.Captu
     [
         (lambda uv: None, "expected UVs, found none"),
         (lambda uv: 3 * uv, "expected UVs in the unit square"),
+        (lambda uv: 0 * uv, "expected UVs that spread the surface out"),
         (lambda uv: np.where(uv[..., :1] > 0.35, uv - np.float32([0.4, 0]), uv) * np.float32(0.5), "used twice"),
     ],
-    ids=["no UVs", "outside the unit square", "overlapping islands"],
+    ids=["no UVs", "outside the unit square", "no area", "overlapping islands"],
 )
 def test_uvs_that_make_no_map(
     tmp_path: Path, garment: Garment, scan_of: Callable[..., Mesh], capsys: pytest.CaptureFixture[str],
