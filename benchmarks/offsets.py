@@ -51,6 +51,7 @@ def run(
     test: tuple[Path, ...] = (),
     size: int = 256,
     epochs: int = 24,
+    baseline_epochs: int = 120,
     components: int = 128,
     workers: int = 2,
 ) -> list[Metric]:
@@ -62,9 +63,10 @@ def run(
             scans with tracked bodies, and its held-out ones. Of several to learn from the last one chooses the epoch,
             of one its last ninth.
         size: texels along the side of the images that are learned.
+        epochs, baseline_epochs: of the decoder, and of the baselines, whose epochs take a second.
     """
     if quick:
-        works, epochs, size = (registered_work(QUICK_TAKE, workers=workers)[1],), 60, 64
+        works, epochs, baseline_epochs, size = (registered_work(QUICK_TAKE, workers=workers)[1],), 60, 60, 64
         tests: tuple[Path, ...] = works
     elif not (train or test):
         config, folder = training_set(quick=False, workers=workers)
@@ -101,7 +103,10 @@ def run(
         "fc": FullyConnected(pose_size, len(layout.vertex)),
         "fc_pca": PcaFullyConnected(pose_size, learned.offsets, components=components),
     }
-    errors = {name: _errors(network, layout, learned, validation, tested, epochs) for name, network in networks.items()}
+    lengths = {"decoder": epochs, "fc": baseline_epochs, "fc_pca": baseline_epochs}
+    errors = {
+        name: _errors(network, layout, learned, validation, tested, lengths[name]) for name, network in networks.items()
+    }
     mean = learned.offsets.mean(dim=0).expand(len(tested), -1, -1)
     baseline = vertex_errors_cm(sampler.positions(mean, tested.points, tested.axes), tested.vertices)
     return [

@@ -129,9 +129,8 @@ def test_running_freely_does_not_drift(clips, tmp_path: Path) -> None:
         network = train_lstm(
             known[:3], known[3:], chosen, spread(known), tmp_path / str(history), lstm=SMALL, config=QUICK
         )
-        kernel = fit_kernel(FittingClips.create(known[:3], known[3:]), chosen, spread(known), KernelConfig())
         loop = np.tile(known[3].controls[:50], (20, 1))
-        for regressor in (linear, network, kernel):
+        for regressor in (linear, network) if history else (network,):  # those that carry something on
             said = regressor.predict(loop).reshape(20, 50, -1)
             np.testing.assert_allclose(said[-1], said[2], atol=0.02 * np.abs(said).max())
 
