@@ -93,7 +93,9 @@ def lesson(config: TrainingSetConfig, folder: Path, *, truth: bool, tracked: boo
             body, poses = load_moving_body(work)
             good = np.array([record["verdict"] == "good" for record in load_records(work / "registration")])
             sequences.append((load_registration(work / "registration"), with_shape(body, poses.shape), poses, good))
-    person = np.mean([poses.shape for _, _, poses, _ in sequences], axis=0).astype(np.float32)
+    learned = learned_takes(config)
+    shapes = [poses.shape for name, (_, _, poses, _) in zip(names, sequences, strict=True) if name in learned]
+    person = np.mean(shapes, axis=0).astype(np.float32)
     takes, frames, weights = [], [], []
     for name, (registered, shaped, poses, good) in zip(names, sequences, strict=True):
         rows = PoseRows.match(registered, shaped, poses)

@@ -2,8 +2,8 @@
 
 DeepWrinkles (ECCV 2018) prints a mean squared error of 2.902 for its linear regression and 1.892 for its LSTM, a ratio
 of 0.65, on shapes of its own; ours are in square millimetres. Beside the defaults stands `paper_`: its network of four
-layers and its linear regression, learned from the takes as they are, without noise on the controls; one seed, from
-registered takes.
+layers, learned from the takes as they are, without noise on the controls, beside our ridge regression with an intercept
+of the same; one seed, from registered takes.
 
 `linear` learns from the takes as they are and in the mirror, as everything does by default; `linear_unmirrored` only
 as they are. The kernels see more than the paper's control vector (`KernelConfig.control`).

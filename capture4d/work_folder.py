@@ -15,11 +15,11 @@ import numpy as np
 from capture4d.atomic_files import read_json, read_json_lines, write_npy_rows
 from capture4d.body_anny import load_anny
 from capture4d.body_stage import load_tracking
-from capture4d.errors import InputError
-from capture4d.records import load_garment
+from capture4d.errors import InputError, StaleError
+from capture4d.records import ArrayFile, load_garment
 from capture4d.scans import Capture, read_body, read_capture, read_poses
 from capture4d.types import Body, PoseSequence, RegisteredSequence
-from capture4d.workdir import Stage
+from capture4d.workdir import Stage, require_complete
 
 __all__ = [
     "ANIMATE",
@@ -50,9 +50,17 @@ def load_registration(folder: Path) -> RegisteredSequence:
     frame_ids = [int(path.stem) for path in sorted((folder / "frames").glob("*.npz"))]
     residual = []
     for frame_id in frame_ids:
-        with np.load(folder / "frames" / f"{frame_id:06d}.npz", allow_pickle=False) as arrays:
+        with ArrayFile(folder / "frames" / f"{frame_id:06d}.npz") as arrays:
             residual.append(arrays["residual_m"])
-    vertices = np.load(folder / "vertices.npy", mmap_mode="r", allow_pickle=False)
+    path = folder / "vertices.npy"
+    try:
+        vertices = np.load(path, mmap_mode="r", allow_pickle=False)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; run the command of '{folder.name}' again") from None
+    except (ValueError, EOFError) as error:
+        raise InputError(f"{path}: expected the vertices of all frames, found a damaged file ({error})") from None
+    if len(vertices) != len(frame_ids):
+        raise InputError(f"{path}: expected vertices of {len(frame_ids)} frames, found {len(vertices)}")
     return RegisteredSequence(garment, vertices, np.array(residual, np.float32), np.array(frame_ids, np.int32))
 
 
@@ -154,7 +162,12 @@ def load_moving_body(work: Path) -> tuple[Body, PoseSequence]:
 def find_moving_body(work: Path) -> tuple[Body, PoseSequence] | None:
     """The same, or None: those that were tracked, or those of the capture."""
     upstream = read_json(work / "registration" / "stage.json").get("upstream", {})
-    if "body" in upstream or is_animated(work):
+    if "body" in upstream:
+        if require_complete(work / "body", "track", f"capture4d track CAPTURE --output {work}") != upstream["body"]:
+            raise StaleError(f"{work}: expected the body with which it was registered, found another; run: capture4d "
+                             f"register CAPTURE --output {work} --tracked --overwrite")  # fmt: skip
+        return load_tracking(work / "body")
+    if is_animated(work):
         return load_tracking(work / "body")
     body, poses = captured_motion(read_capture(capture_path(work)))
     return None if body is None or poses is None else (body, poses)

@@ -93,6 +93,8 @@ def run(
         upstream["regressor"] = hashlib.sha256(coefficients.tobytes()).hexdigest()
     if body is not None:
         upstream["body"] = file_digest([body], root=body.parent)
+    captured = captured_person(known.model, known.body)
+    mean = retargeted_mean(known.model, captured, person, formula=config.mean)
     settings = {**asdict(config), "beta": [float(value) for value in person.shape]}
     sources = {"model": known.folder, "poses": poses}
     stage = open_stage(
@@ -100,8 +102,6 @@ def run(
     )
     save_body(output / "body" / "body.npz", person.body)
     save_poses(output / "body" / "poses.npz", motion)
-    captured = captured_person(known.model, known.body)
-    mean = retargeted_mean(known.model, captured, person, formula=config.mean)
     garment = known.model.garment
     template = garment.template.with_vertices(mean.astype(np.float32))
     save_garment(folder / "garment.npz", replace(garment, template=template, body_shape=motion.shape))
@@ -158,6 +158,9 @@ def _person(known: GarmentModel, body: Path | None, beta: Sequence[float] | None
 def _motion(known: GarmentModel, path: Path, person: ShapedBody) -> PoseSequence:
     """The motion at the model's rate, on the person."""
     poses = read_motion(path, person.body)
+    if not len(poses.frame_ids) or (np.diff(poses.frame_ids) <= 0).any():
+        raise InputError(f"{path}: expected frames with ascending numbers, found {len(poses.frame_ids)} frames"
+                         f"{' in disorder' if len(poses.frame_ids) else ''}")  # fmt: skip
     if poses.joint_names != known.model.joint_names:
         raise InputError(
             f"{path}: expected the {len(known.model.joint_names)} joints of the model, found {len(poses.joint_names)} "

@@ -1,9 +1,11 @@
-"""Settings of the garment model. Standard library only, so that the command line can list them at once."""
+"""Settings of the garment model. No heavy imports, so that the command line can list them at once."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from typing import Literal
+
+from capture4d.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -156,6 +158,45 @@ class FitConfig:
     kernel: KernelConfig = field(default_factory=KernelConfig)
     lstm: LstmConfig = field(default_factory=LstmConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)
+
+
+def check_fit(config: FitConfig) -> None:
+    """
+    Raises:
+        InputError: a setting is out of range; the message names it.
+    """
+    shape, control, kernel, training = config.shape, config.control, config.kernel, config.training
+    least = {
+        "shape.components": (shape.components, 0),
+        "shape.most_components": (shape.most_components, 1),
+        "shape.filling_rounds": (shape.filling_rounds, 0),
+        "kernel.most_frames": (kernel.most_frames, 2),
+        "lstm.layers": (config.lstm.layers, 1),
+        "lstm.size": (config.lstm.size, 1),
+        "lstm.window": (config.lstm.window, 1),
+        "training.epochs": (training.epochs, 0),
+        "training.batch": (training.batch, 1),
+        "training.patience": (training.patience, 1),
+        "training.threads": (training.threads, 1),
+        "control.history": (control.history, 0),
+        "control.derivative_frames": (control.derivative_frames, 3),
+        "kernel.control.derivative_frames": (kernel.control.derivative_frames, 3),
+    }
+    for name, lags in (("control.lags", control.lags), ("kernel.control.lags", kernel.control.lags)):
+        least |= {name: (min(lags, default=1), 1)}
+    for name, (value, bound) in least.items():
+        if value < bound:
+            raise InputError(f"{name}: expected at least {bound}, found {value}")
+    if kernel.control.history:
+        raise InputError(
+            f"kernel.control.history: expected 0, found {kernel.control.history}; kernels carry nothing on"
+        )
+    for name, ridges in (("linear.ridges", config.linear.ridges), ("kernel.ridges", kernel.ridges)):
+        if not ridges or min(ridges) < 0 or (name == "kernel.ridges" and min(ridges) == 0):
+            raise InputError(f"{name}: expected positive penalties, found {' '.join(map(str, ridges)) or 'none'}")
+    if not 0 <= config.split.validation_share < 1:
+        found = config.split.validation_share
+        raise InputError(f"split.validation_share: expected a share from 0 to below 1, found {found:g}")
 
 
 @dataclass(frozen=True)

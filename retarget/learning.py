@@ -151,6 +151,7 @@ def fitting_clips(
 
     training = clips(learned, "training")
     validation = regression_clips(takes, pieces, "validation", layout, space, None, projected)
+    validation = [clip for clip in validation if clip.good.any()]  # the others decide nothing
     return FittingClips(training, validation, [*training, *clips(late, "validation")])
 
 
@@ -183,15 +184,16 @@ def vertex_error_m(
 def training_poses(
     takes: UnposedTakes, pieces: Sequence[Piece], layout: ControlLayout, mirror: Mirror | None = None
 ) -> PoseRange:
-    """The poses that were learned from, and how far away from them the validation frames were."""
+    """The poses of the good frames that were learned from, and how far away from them those of validation were."""
 
     def quaternions(role: Role, mirror: Mirror | None) -> np.ndarray:
         found = [np.zeros((0, len(layout.joints), 4), np.float32)]
         for piece in pieces:
             if piece.role == role:
-                poses = takes.takes[piece.take].poses
-                rotations = (poses if mirror is None else mirror.poses(poses)).rotations
-                found.append(pose_quaternions(rotations[piece.frames.start : piece.frames.stop], layout.joints))
+                take = takes.takes[piece.take]
+                rotations = (take.poses if mirror is None else mirror.poses(take.poses)).rotations
+                good = np.flatnonzero(take.good[piece.frames.start : piece.frames.stop]) + piece.frames.start
+                found.append(pose_quaternions(rotations[good], layout.joints))
         return np.concatenate(found)
 
     known, validated = quaternions("training", None), quaternions("validation", None)

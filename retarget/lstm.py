@@ -26,7 +26,7 @@ from retarget.controls import ControlLayout
 from retarget.linear import LinearRegressor
 from retarget.regressors import History, Scales, read_regressor, write_regressor
 
-__all__ = ["EncoderDecoder", "LstmRegressor", "load_lstm", "save_lstm"]
+__all__ = ["EncoderDecoder", "LstmRegressor", "load_lstm", "save_lstm", "usable_device"]
 
 _KIND = "capture4d lstm regressor"
 BATCH = 1024
@@ -128,6 +128,19 @@ def frame_windows(
     return rows[positions]
 
 
+def usable_device(name: str) -> torch.device:
+    """
+    Raises:
+        InputError: torch does not know it, or cannot compute there.
+    """
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise InputError(f"device: expected one that torch can use, such as cpu, found '{name}' ({error})") from None
+    return device
+
+
 def save_lstm(path: Path, regressor: LstmRegressor, *, model_digest: str) -> None:
     weights = {f"network.{name}": each.numpy(force=True) for name, each in regressor.network.state_dict().items()}
     note = {"lstm": asdict(regressor.config)}
@@ -152,13 +165,17 @@ def load_lstm(
         InputError: the file is damaged, another kind, or belongs to another model.
     """
     file, layout, scales = read_regressor(path, _KIND, model_digest=model_digest)
-    config = LstmConfig(**file.entry("lstm"))
+    try:
+        config = LstmConfig(**file.entry("lstm"))
+    except TypeError as error:
+        raise InputError(f"{path}: expected the settings of an LSTM, found others ({error})") from None
+    placed = usable_device(device)
     shapes = len(scales.std)
     network = EncoderDecoder(layout.size + layout.config.history * shapes, shapes, config)
     _load_weights(network, file.prefixed("network."), path)
     if config.over_linear and linear is None:
         raise InputError(f"{path}: expected the linear regression it was trained over beside it, found none")
-    return LstmRegressor(layout, scales, config, network.to(device).eval(), linear if config.over_linear else None)
+    return LstmRegressor(layout, scales, config, network.to(placed).eval(), linear if config.over_linear else None)
 
 
 def _load_weights(network: nn.Module, weights: Mapping[str, np.ndarray], path: Path) -> None:

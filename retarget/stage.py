@@ -31,11 +31,11 @@ from capture4d.errors import InputError
 from capture4d.garment_binding import with_body_shape
 from capture4d.records import load_body, load_garment, save_body
 from capture4d.types import BlendshapeModel, Body, PoseSequence
-from capture4d.work_folder import load_moving_body, load_records, load_registration
+from capture4d.work_folder import VERDICTS, load_moving_body, load_records, load_registration
 from capture4d.workdir import Stage, open_stage, require_complete
 from capture4d.workers import run_jobs
 from retarget.blendshapes import ShapeSpace, as_model_arrays, shape_space, worst_errors
-from retarget.config import FitConfig
+from retarget.config import FitConfig, check_fit
 from retarget.controls import ControlLayout
 from retarget.kernel import KernelRegressor, fit_kernel, load_kernel, save_kernel
 from retarget.learning import (
@@ -76,11 +76,14 @@ def run(
     """Learn a garment from registered takes; the digest of the result.
 
     Args:
-        works: work folders, each with a finished registration/. Their names are the takes' names.
+        works: work folders, each with a finished registration/, in any order. Their names are the takes' names.
         device: of the training.
     Raises:
-        InputError: a registration is missing, takes do not fit together, or there are too few good frames.
+        InputError: a registration is missing, takes do not fit together, a setting is out of range, or there are too
+            few good frames.
     """
+    check_fit(config)
+    works = sorted(works, key=lambda work: work.resolve().name)
     names = [work.resolve().name for work in works]
     if len(set(names)) != len(names):
         raise InputError(f"takes: expected work folders of different names, found {', '.join(sorted(names))}")
@@ -88,16 +91,19 @@ def run(
         name: require_complete(work / "registration", "register", f"capture4d run CAPTURE --output {work}")
         for name, work in zip(names, works, strict=True)
     }
-    stage = open_stage(output, name="fit", schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite)
-    if (output / "fit.json").is_file():  # the last file of a run
-        return _finish(stage)
     body, moving = _moving_bodies(works)
-    person = np.mean([poses.shape for poses in moving], axis=0).astype(np.float32)
+    split_takes(names, [len(poses.frame_ids) for poses in moving], moving[0].fps, config.split)
+    stage = open_stage(output, name="fit", schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite)
+    if (output / "fit.json").is_file() and all((output / name).is_file() for name in _files(config)):
+        return _finish(stage, config)
+    learned = [poses.shape for name, poses in zip(names, moving, strict=True) if name not in config.split.held_out]
+    person = np.mean(learned, axis=0).astype(np.float32)
     if not (output / "body.npz").is_file():
         save_body(output / "body.npz", body)
     unpose = partial(_unpose_take, stage.path, config.shape.unseen_weight, person)
     jobs = [_UnposeJob(name, work) for name, work in zip(names, works, strict=True)
-            if not (stage.path / "takes" / f"{name}.json").is_file()]  # fmt: skip
+            if not ((stage.path / "takes" / f"{name}.json").is_file()
+                    and (stage.path / "unposed" / f"{name}.weights.npy").is_file())]  # fmt: skip
     for _ in run_jobs(unpose, jobs, workers=workers, label="unpose"):
         pass
     takes = _stacked(stage, works, names, body, moving)
@@ -111,12 +117,17 @@ def run(
     split = {role: [_piece_name(names, piece) for piece in pieces if piece.role == role]
              for role in ROLES}  # fmt: skip
     write_json(output / "fit.json", {"split": split, "validated_deg": known.validated_deg, **note})
-    return _finish(stage)
+    return _finish(stage, config)
 
 
-def _finish(stage: Stage) -> str:
-    files = [stage.path / name for name in ("body.npz", MODEL, LINEAR, KERNEL, LSTM, POSES)]
-    digest = stage.finish([path for path in files if path.is_file()])
+def _files(config: FitConfig) -> list[str]:
+    """What a finished model consists of."""
+    kernel, network = config.regressor != "linear", config.regressor == "all"
+    return ["body.npz", MODEL, LINEAR, POSES, *([KERNEL] if kernel else []), *([LSTM] if network else [])]
+
+
+def _finish(stage: Stage, config: FitConfig) -> str:
+    digest = stage.finish([stage.path / name for name in _files(config)])
     shutil.rmtree(stage.path / "unposed", ignore_errors=True)
     return digest
 
@@ -141,8 +152,11 @@ def learned_frames(folder: Path, registration: str) -> list[range]:
     """
     taken = read_json(folder / "stage.json").get("upstream", {})
     names = [name for name, digest in taken.items() if digest == registration]
-    split = read_json(folder / "fit.json")["split"]
-    pieces = {role: [_PIECE.fullmatch(piece) for piece in split[role]] for role in ("training", "validation")}
+    try:
+        split = read_json(folder / "fit.json")["split"]
+        pieces = {role: [_PIECE.fullmatch(piece) for piece in split[role]] for role in ("training", "validation")}
+    except (KeyError, TypeError):
+        raise InputError(f"{folder / 'fit.json'}: expected the split of the takes, found none") from None
 
     def frames(role: str) -> list[range]:
         return [range(int(piece[2]), int(piece[3])) for piece in pieces[role] if piece and piece[1] in names]
@@ -196,7 +210,12 @@ def _unpose_take(output: Path, unseen_weight: float, person: np.ndarray, job: _U
     folder = output / "unposed"
     write_npy_rows(folder / f"{job.name}.vertices.npy", frames(), count=len(registered.frame_ids))
     write_npy(folder / f"{job.name}.weights.npy", np.stack(weights))
-    verdicts = [record["verdict"] for record in load_records(job.work / "registration")]
+    found = {record.get("frame_id"): record.get("verdict") for record in load_records(job.work / "registration")}
+    for frame_id in registered.frame_ids.tolist():
+        if found.get(frame_id) not in VERDICTS:
+            path = job.work / "registration" / "metrics.jsonl"
+            raise InputError(f"{path}: frame {frame_id}: expected a verdict, found {found.get(frame_id) or 'none'}")
+    verdicts = [found[frame_id] for frame_id in registered.frame_ids.tolist()]
     write_json(output / "takes" / f"{job.name}.json", {"frames": registered.frame_ids, "verdicts": verdicts})
 
 
@@ -303,7 +322,8 @@ def _regressors(
     for name, regressor in regressors.items():
         note[name] = {"ridge": regressor.ridge} if isinstance(regressor, (LinearRegressor, KernelRegressor)) else {}
         for role in ROLES:
-            if known := regression_clips(takes, pieces, role, regressor.layout, space, None, projected):
+            known = regression_clips(takes, pieces, role, regressor.layout, space, None, projected)
+            if any(clip.good.any() for clip in known):
                 error = vertex_error_m(takes, pieces, role, space, predictions(regressor, known))
                 note[name][role.replace(" ", "_")] = {
                     "coefficient_mse_mm2": 1e6 * mean_squared_error(regressor, known),
@@ -381,6 +401,9 @@ def load_garment_model(path: Path, *, device: str = "cpu", with_lstm: bool = Tru
         raise InputError(f"{path}: expected {MODEL} or the folder that holds it, found another file")
     if not (folder / MODEL).is_file():
         raise InputError(f"{folder}: expected a model ({MODEL}), found none; run: capture4d fit WORK")
+    record = read_json(folder / "stage.json") if (folder / "stage.json").is_file() else {}
+    if record.get("status", "complete") != "complete":
+        raise InputError(f"{folder}: 'fit' is not finished; run its command again")
     model = load_blendshapes(folder / MODEL)
     digest = _digest(folder)
     linear = load_linear(folder / LINEAR, model_digest=digest)
@@ -389,6 +412,8 @@ def load_garment_model(path: Path, *, device: str = "cpu", with_lstm: bool = Tru
     kernel = None
     if (folder / KERNEL).is_file():
         kernel = load_kernel(folder / KERNEL, model_digest=digest)
+        if len(kernel.middle) != len(model.std):
+            raise InputError(f"{folder / KERNEL}: expected {len(model.std)} coefficients, found {len(kernel.middle)}")
     lstm = None
     if with_lstm and (folder / LSTM).is_file():
         from retarget.lstm import load_lstm

@@ -28,7 +28,7 @@ from capture4d.tensor_files import read_tensors, write_tensors
 from retarget.config import LinearConfig, LstmConfig, TrainingConfig
 from retarget.controls import ControlLayout
 from retarget.linear import LinearRegressor, fit_linear
-from retarget.lstm import EncoderDecoder, LstmRegressor, frame_windows
+from retarget.lstm import EncoderDecoder, LstmRegressor, frame_windows, usable_device
 from retarget.regressors import Clip, FittingClips, Scales, mean_squared_error, usual_response, with_history
 
 __all__ = ["fit_lstm", "train_lstm"]
@@ -128,7 +128,7 @@ def train_lstm(
     elif linear is None:
         raise InputError("training: expected a linear regression, over which the LSTM is to learn, found none")
     scales, inputs, targets, known = _windows(training, layout, std, lstm, linear)
-    place = _device(device)
+    place = usable_device(device)
     with _threads(config.threads):
         torch.manual_seed(config.seed)
         network = EncoderDecoder(inputs.shape[2], targets.shape[2], lstm).to(place)
@@ -168,6 +168,8 @@ def train_lstm(
                 torch.nn.utils.clip_grad_norm_(network.parameters(), config.clip_gradient, foreach=False)
                 optimiser.step()
                 progress.loss_sum += float(loss.detach())
+                if not math.isfinite(progress.loss_sum):
+                    raise InputError(f"training: the loss is no number in epoch {progress.epoch}; try a lower rate")
                 progress.step += 1
                 if time.monotonic() - saved >= config.checkpoint_s:
                     _save(checkpoint, network, optimiser, best, progress)
@@ -230,15 +232,6 @@ def _loss_weights(scales: Scales, config: TrainingConfig) -> Float[Tensor, " sha
         return torch.ones(len(scales.std))
     squares = torch.from_numpy(scales.std.astype(np.float64) ** 2)
     return (squares / squares.mean()).float()
-
-
-def _device(name: str) -> torch.device:
-    try:
-        device = torch.device(name)
-        torch.zeros(1, device=device)
-    except (RuntimeError, AssertionError) as error:
-        raise InputError(f"device: expected one that torch can use, such as cpu, found '{name}' ({error})") from None
-    return device
 
 
 @contextlib.contextmanager

@@ -135,9 +135,11 @@ def write_work(make_world):
     def write(work: Path, poses: PoseSequence, *, world: World | None = None, flagged: tuple[int, ...] = ()) -> Path:
         world = world or make_world()
         registered = world.registered(poses)
-        stage = open_stage(
-            work / "registration", name=REGISTER, schema=1, config={}, upstream={"body": "x", "garment": work.name}
-        )
+        tracked = open_stage(work / "body", name="track", schema=1, config={}, upstream={})
+        save_body(tracked.path / "body.npz", world.body)
+        save_poses(tracked.path / "poses.npz", poses)
+        upstream = {"body": tracked.finish([tracked.path / "poses.npz"]), "garment": work.name}
+        stage = open_stage(work / "registration", name=REGISTER, schema=1, config={}, upstream=upstream)
         save_garment(stage.path / "garment.npz", registered.garment)
         records = []
         for row, frame_id in enumerate(poses.frame_ids.tolist()):
@@ -150,8 +152,6 @@ def write_work(make_world):
         lines = "".join(json.dumps(record) + "\n" for record in records)
         write_bytes(stage.path / "metrics.jsonl", lines.encode())
         stage.finish([stage.path / "vertices.npy"])
-        save_body(work / "body" / "body.npz", world.body)
-        save_poses(work / "body" / "poses.npz", poses)
         return work
 
     return write

@@ -23,7 +23,7 @@ from retarget.controls import ControlLayout, control_vectors
 from retarget.kernel import fit_kernel, load_kernel, save_kernel
 from retarget.linear import fit_linear, load_linear, save_linear
 from retarget.lstm import EncoderDecoder, LstmRegressor, load_lstm, save_lstm
-from retarget.regressors import Clip, FittingClips, mean_squared_error
+from retarget.regressors import Clip, FittingClips, History, mean_squared_error, with_history
 from retarget.training import fit_lstm, train_lstm
 
 NAMES = ("root", "middle", "top")
@@ -118,6 +118,16 @@ def test_streaming_equals_batch(clips, kind: str, history: int, tmp_path: Path) 
     stream = found.stream()
     again = np.stack([stream.push(row) for row in known[3].controls])
     np.testing.assert_allclose(again, whole, atol=1e-5 * np.abs(whole).max())
+
+
+def test_what_training_sees_of_the_frames_before_is_what_a_stream_carries_on(clips) -> None:
+    (clip,) = clips(count=1)
+    std = spread([clip])
+    history, rows = History(2, len(std)), []
+    for controls, coefficients in zip(clip.controls, clip.coefficients, strict=True):
+        rows.append(history.extend(controls))
+        history.push(coefficients / std)
+    np.testing.assert_allclose(np.stack(rows), with_history(clip, 2, std).controls, atol=1e-5)
 
 
 def test_running_freely_does_not_drift(clips, tmp_path: Path) -> None:

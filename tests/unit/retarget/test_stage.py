@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from capture4d.app.cli import main
-from capture4d.atomic_files import read_json
+from capture4d.atomic_files import read_json, write_json
 from capture4d.blendshape_files import load_blendshapes
 from capture4d.body import pose_frame, skin, with_shape
 from capture4d.errors import InputError
@@ -196,11 +196,11 @@ def test_takes_that_do_not_fit_together_are_one_line(works, write_work, motion, 
     world = make_world()
     faces = world.garment.template.faces[:-1].copy()
     template = replace(world.garment.template, faces=faces, uv=None)
-    other = write_work(tmp_path / "other", motion(10, 7))
+    other = write_work(tmp_path / "take8", motion(10, 7))
     save_garment(other / "registration" / "garment.npz", replace(world.garment, template=template))
     line = fails(capsys, "fit", *works, other, "--output", tmp_path / "x", *QUICK)
-    assert "other: expected the template of" in line
-    slow = write_work(tmp_path / "slow", replace(motion(10, 7), fps=30.0))
+    assert "take8: expected the template of" in line
+    slow = write_work(tmp_path / "take7", replace(motion(10, 7), fps=30.0))
     assert "expected 60 frames a second" in fails(capsys, "fit", *works, slow, "--output", tmp_path / "y", *QUICK)
     assert "--output: expected" in fails(capsys, "fit", *works)
     assert "found take0, take0" in fails(capsys, "fit", works[0], works[0], "--output", tmp_path / "z")
@@ -231,10 +231,97 @@ def test_poses_of_another_skeleton_are_one_line(model: Path, motion, tmp_path: P
 
 def test_a_tracked_take_is_never_written_over(model: Path, works, tmp_path: Path, capsys) -> None:
     poses = works[0] / "body" / "poses.npz"
-    assert "found output of 'register'" in fails(capsys, *animate(model, poses, works[1]))
-    (tmp_path / "tracked" / "body").mkdir(parents=True)
-    (tmp_path / "tracked" / "body" / "stage.json").write_text("{}")
-    assert "found a take with a tracked body" in fails(capsys, *animate(model, poses, tmp_path / "tracked"))
+    assert "found a take with a tracked body" in fails(capsys, *animate(model, poses, works[1]))
+    shutil.copytree(works[1] / "registration", tmp_path / "registered" / "registration")
+    assert "found output of 'register'" in fails(capsys, *animate(model, poses, tmp_path / "registered"))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (("--training.patience", "0"), "training.patience: expected at least 1, found 0"),
+        (("--shape.components", "-1"), "shape.components: expected at least 0, found -1"),
+        (("--kernel.ridges", "0"), "kernel.ridges: expected positive penalties, found 0.0"),
+        (("--control.lags", "-1"), "control.lags: expected at least 1, found -1"),
+        (("--kernel.control.history", "2"), "kernel.control.history: expected 0, found 2"),
+        (("--split.validation-share", "1"), "split.validation_share: expected a share from 0 to below 1, found 1"),
+        (("--split.held-out", "take9"), "found 'take9'"),
+    ],
+)
+def test_wrong_settings_leave_nothing_behind(works, tmp_path: Path, capsys, wrong: tuple[str, str], said: str) -> None:
+    assert said in fails(capsys, "fit", *works, "--output", tmp_path / "x", *QUICK, *wrong)
+    assert not (tmp_path / "x" / "retarget" / "stage.json").exists()
+
+
+def test_takes_in_another_order_are_the_same_takes(model: Path, works) -> None:
+    """What an earlier run left is not read as somebody else's."""
+    before = {path.name: path.read_bytes() for path in model.glob("*.safetensors")}
+    shutil.rmtree(model)
+    backwards = ("fit", *works[::-1], "--output", model.parent, "--split.validation", "take2", "--licence", "CC0")
+    assert run(*backwards, *QUICK) == 0
+    assert {path.name: path.read_bytes() for path in model.glob("*.safetensors")} == before
+
+
+def test_verdicts_belong_to_frames_not_to_lines(write_work, motion, tmp_path: Path, capsys) -> None:
+    work = write_work(tmp_path / "short", motion(12, 0))
+    lines = (work / "registration" / "metrics.jsonl").read_text().splitlines()
+    (work / "registration" / "metrics.jsonl").write_text("\n".join(lines[3:]))
+    said = fails(capsys, "fit", work, "--output", tmp_path / "x", *QUICK)
+    assert "metrics.jsonl: frame 1: expected a verdict, found none" in said
+
+
+def test_a_body_tracked_anew_wants_a_new_registration(write_work, motion, tmp_path: Path, capsys) -> None:
+    work = write_work(tmp_path / "take", motion(12, 0))
+    record = read_json(work / "body" / "stage.json")
+    write_json(work / "body" / "stage.json", {**record, "digest": "another"})
+    said = fails(capsys, "fit", work, "--output", tmp_path / "x", *QUICK)
+    assert "expected the body with which it was registered" in said
+
+
+def test_a_damaged_registration_is_one_line(write_work, motion, tmp_path: Path, capsys) -> None:
+    work = write_work(tmp_path / "take", motion(12, 0))
+    for name, said in (("frames/000003.npz", "not a readable npz file"), ("vertices.npy", "found a damaged file")):
+        path = work / "registration" / name
+        whole = path.read_bytes()
+        path.write_bytes(whole[: len(whole) // 2])
+        assert said in fails(capsys, "fit", work, "--output", tmp_path / "x", *QUICK)
+        path.write_bytes(whole)
+
+
+def test_a_motion_in_disorder_is_one_line(model: Path, motion, tmp_path: Path, capsys) -> None:
+    poses = motion(4, 0)
+    save_poses(tmp_path / "poses.npz", replace(poses, frame_ids=poses.frame_ids[::-1].copy()))
+    said = fails(capsys, *animate(model, tmp_path / "poses.npz", tmp_path / "x"))
+    assert "expected frames with ascending numbers, found 4 frames in disorder" in said
+
+
+def test_a_body_of_other_faces_leaves_nothing_behind(model: Path, works, tmp_path: Path, capsys) -> None:
+    body = load_body(model / "body.npz")
+    turned = replace(body, template=replace(body.template, faces=body.template.faces[::-1].copy(), uv=None))
+    save_body(tmp_path / "body.npz", turned)
+    poses, output = works[0] / "body" / "poses.npz", tmp_path / "x"
+    assert "faces" in fails(capsys, *animate(model, poses, output, "--body", tmp_path / "body.npz"))
+    assert run(*animate(model, poses, output)) == 0
+
+
+def test_a_device_that_is_not_there_is_one_line(model: Path, works, tmp_path: Path, capsys) -> None:
+    poses = works[0] / "body" / "poses.npz"
+    said = fails(capsys, *animate(model, poses, tmp_path / "x", "--regressor", "lstm", "--device", "nonsense"))
+    assert "device: expected one that torch can use" in said
+
+
+def test_an_unfinished_model_is_not_animated_and_lost_files_are_made_again(
+    model: Path, works, tmp_path: Path, capsys
+) -> None:
+    poses = works[0] / "body" / "poses.npz"
+    kernel = (model / "kernel.safetensors").read_bytes()
+    (model / "kernel.safetensors").unlink()
+    again = ("fit", *works, "--output", model.parent, "--split.validation", "take2", "--licence", "CC0", *QUICK)
+    assert run(*again) == 0
+    assert (model / "kernel.safetensors").read_bytes() == kernel
+    record = read_json(model / "stage.json")
+    write_json(model / "stage.json", {**record, "status": "running"})
+    assert "'fit' is not finished" in fails(capsys, *animate(model, poses, tmp_path / "x"))
 
 
 def test_damaged_models_are_one_line(model: Path, works, tmp_path: Path, capsys) -> None:
