@@ -127,7 +127,7 @@ def comparison(work: Path) -> Comparison | None:
     return Comparison(
         len(found["frames"]),
         found["against_truth"],
-        found["methods"],
+        [{"learned": False} | row for row in found["methods"]],  # earlier versions did not say
         [(frame["frame_id"], panels(frame)) for frame in found["pictures"]],
         panels(found["people"]),
         found["people"]["frame_id"],
