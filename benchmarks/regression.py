@@ -143,7 +143,8 @@ def _network(
             clips, layout, std, Path(scratch),
             lstm=config.lstm, config=settings, linear=linear, linear_config=config.linear,
         )  # fmt: skip
-        lines = (Path(scratch) / "training" / "metrics.jsonl").read_text().splitlines()
+        runs = [Path(scratch) / name / "metrics.jsonl" for name in ("training", "final")]  # first: with validation
+        lines = next(path for path in runs if path.is_file()).read_text().splitlines()
     Console(stderr=True).print(f"seed {seed}: {len(lines)} epochs, {lines[-1]}", soft_wrap=True)
     return found
 
