@@ -170,13 +170,18 @@ def _drawn(layout: OffsetLayout, frames: OffsetFrames) -> Float16[Tensor, "frame
 
 
 def _start_from_mean(network: nn.Module, train: OffsetFrames, drawn: Tensor | None) -> None:
+    """Let a network that has learned nothing yet give the mean of the frames, whatever the pose."""
     with torch.no_grad():
         if isinstance(network, ImageDecoder) and drawn is not None:
             network.mean.copy_(drawn.mean(dim=0, dtype=torch.float32))
-        elif isinstance(network, FullyConnected):
+        if isinstance(network, (ImageDecoder, FullyConnected)):
             last = network.layers[-1]
-            assert isinstance(last, nn.Linear)
-            last.bias.copy_(train.offsets.mean(dim=0).flatten())
+            assert isinstance(last, (nn.Conv2d, nn.Linear))
+            assert last.bias is not None
+            last.weight.zero_()
+            last.bias.zero_()
+            if isinstance(network, FullyConnected):
+                last.bias.copy_(train.offsets.mean(dim=0).flatten())
 
 
 def train_offsets(
