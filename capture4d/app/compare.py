@@ -332,7 +332,9 @@ def _offset_methods(
     }
     methods = []
     for name, network in networks.items():
-        train_offsets(network, layout, *parts, OffsetConfig(epochs=config.epochs, batch=min(16, max(4, len(parts[0]) // 8))))
+        train_offsets(
+            network, layout, *parts, OffsetConfig(epochs=config.epochs, batch=min(16, max(4, len(parts[0]) // 8)))
+        )
         made, ms = _predicted(network, sampler, held)
         methods.append(
             _drawn_by(name, template, made, template.low_normals, _megabytes(network), extra_ms=ms, has_map=False)
