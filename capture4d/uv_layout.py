@@ -16,7 +16,7 @@ from capture4d.mesh import face_areas
 from capture4d.tangents import TangentLayout
 from capture4d.types import Mesh
 
-__all__ = ["Layout", "millimetres_per_texel", "pack_islands", "unit_square", "uv_area"]
+__all__ = ["Layout", "millimetres_per_texel", "pack_islands", "require_uvs", "unit_square"]
 
 Layout = Literal["auto", "keep", "pack"]
 METRIC_TOLERANCE = 0.35
@@ -35,11 +35,8 @@ def unit_square(mesh: Mesh, *, layout: Layout = "auto", gap: float) -> Mesh:
     Raises:
         InputError: there are no UVs, they have no area, or they are neither in the unit square nor a pattern in metres.
     """
-    if mesh.uv is None:
-        raise InputError("template: expected UVs, found none; `capture4d template --uv fresh` cuts some")
-    if uv_area(mesh) <= 0:
-        raise InputError("template: expected UVs that spread the surface out, found none with any area")
-    low, high = float(mesh.uv.min(initial=0)), float(mesh.uv.max(initial=0))
+    uv = require_uvs(mesh)
+    low, high = float(uv.min(initial=0)), float(uv.max(initial=0))
     fits = low >= 0 and high <= 1
     if layout == "keep" or (layout == "auto" and not fits and not _is_metric(mesh)):
         if fits:
@@ -48,8 +45,20 @@ def unit_square(mesh: Mesh, *, layout: Layout = "auto", gap: float) -> Mesh:
                          f"{low:.3g} to {high:.3g}")  # fmt: skip
     if layout == "auto" and fits:
         return mesh
-    islands = TangentLayout(mesh.faces, mesh.uv).islands()
-    return Mesh(mesh.vertices, mesh.faces, pack_islands([mesh.uv], [islands], gap=gap)[0])
+    islands = TangentLayout(mesh.faces, uv).islands()
+    return Mesh(mesh.vertices, mesh.faces, pack_islands([uv], [islands], gap=gap)[0])
+
+
+def require_uvs(mesh: Mesh) -> Float32[np.ndarray, "F 3 2"]:
+    """
+    Raises:
+        InputError: there are no UVs, or all faces have shrunk to nothing in them.
+    """
+    if mesh.uv is None:
+        raise InputError("template: expected UVs, found none; `capture4d template --uv fresh` cuts some")
+    if _uv_area(mesh) <= 0:
+        raise InputError("template: expected UVs that spread the surface out, found none with any area")
+    return mesh.uv
 
 
 def pack_islands(
@@ -77,11 +86,10 @@ def pack_islands(
 def millimetres_per_texel(mesh: Mesh, size: int) -> float:
     """Length on the mesh that one texel shows, in the mean over the surface."""
     assert mesh.uv is not None
-    return 1e3 * float(np.sqrt(face_areas(mesh.vertices.astype(float), mesh.faces).sum() / uv_area(mesh))) / size
+    return 1e3 * float(np.sqrt(face_areas(mesh.vertices.astype(float), mesh.faces).sum() / _uv_area(mesh))) / size
 
 
-def uv_area(mesh: Mesh) -> float:
-    """Sum of the faces' areas in the UV plane."""
+def _uv_area(mesh: Mesh) -> float:
     assert mesh.uv is not None
     along, across = (mesh.uv[:, k].astype(float) - mesh.uv[:, 0] for k in (1, 2))
     return float(np.abs(along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]).sum() / 2)
@@ -89,7 +97,7 @@ def uv_area(mesh: Mesh) -> float:
 
 def _is_metric(mesh: Mesh) -> bool:
     on_mesh = float(face_areas(mesh.vertices.astype(float), mesh.faces).sum())
-    return bool(abs(np.sqrt(uv_area(mesh) / max(on_mesh, 1e-12)) - 1) < METRIC_TOLERANCE)
+    return bool(abs(np.sqrt(_uv_area(mesh) / max(on_mesh, 1e-12)) - 1) < METRIC_TOLERANCE)
 
 
 def _boxes(uv: np.ndarray, island: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

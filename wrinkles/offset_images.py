@@ -27,7 +27,7 @@ from capture4d.errors import InputError
 from capture4d.mesh import vertex_normals
 from capture4d.tangents import TangentLayout, interpolated_frames, uv_corners
 from capture4d.types import Garment, Mesh
-from capture4d.uv_layout import pack_islands, uv_area
+from capture4d.uv_layout import pack_islands, require_uvs
 from capture4d.uv_raster import UvRaster, rasterise_uv, sample_bilinear
 
 __all__ = ["Anchors", "OffsetLayout", "OffsetSampler", "OffsetSpace", "decode", "encode"]
@@ -80,20 +80,17 @@ class OffsetLayout:
             InputError: the template has no UVs or islands that do not fit, or is not bound to a body.
         """
         mesh = garment.template
-        if mesh.uv is None:
-            raise InputError("template: expected UVs, found none; `capture4d template --uv fresh` cuts some")
-        if uv_area(mesh) <= 0:
-            raise InputError("template: expected UVs that spread the surface out, found none with any area")
+        mesh_uv = require_uvs(mesh)
         if garment.embedding_faces is None:
             raise InputError("template: expected a garment bound to a body, found none; run: capture4d template MESH")
-        islands = TangentLayout(mesh.faces, mesh.uv).islands()
+        islands = TangentLayout(mesh.faces, mesh_uv).islands()
         side = _sides(mesh, islands)[islands]
         gap = (2 * padding + 2) / size
         kept = [side == 0, side == 1]
         numbers = [np.unique(islands[keep], return_inverse=True)[1].astype(np.int32) for keep in kept]
-        uv = np.empty_like(mesh.uv)
+        uv = np.empty_like(mesh_uv)
         drawn = [index for index in range(2) if kept[index].any()]
-        for index, packed in zip(drawn, pack_islands([mesh.uv[kept[i]] for i in drawn], [numbers[i] for i in drawn],
+        for index, packed in zip(drawn, pack_islands([mesh_uv[kept[i]] for i in drawn], [numbers[i] for i in drawn],
                                                      gap=gap), strict=True):  # fmt: skip
             uv[kept[index]] = packed
         keyed = uv + 2 * side[:, None, None].astype(np.float32)  # equal UVs of two images are two pixels

@@ -25,19 +25,18 @@ import numpy as np
 import torch
 
 from capture4d.app.compare_config import CompareConfig
-from capture4d.app.compare_garment import Modelled, model_take
+from capture4d.app.compare_garment import Modelled, ModelledSurface, model_take
+from capture4d.app.compare_offsets import megabytes, offset_surfaces
 from capture4d.app.render import Drawn, heat_colours, render
 from capture4d.app.report_pictures import CLOTH, HEIGHT, SKIN, WIDTH, Framing, Panel, colour_bar, data_uri, write_panel
 from capture4d.atomic_files import file_digest, read_json, write_bytes, write_json
-from capture4d.body import with_shape
 from capture4d.errors import InputError
 from capture4d.evaluation import correspondence_errors, material_points
 from capture4d.scans import Capture, read_scan, read_truth_model, read_truth_vertices
-from capture4d.types import Body, PoseSequence, RegisteredSequence
+from capture4d.types import RegisteredSequence
 from capture4d.uv_layout import millimetres_per_texel
 from capture4d.work_folder import failed_frames, find_moving_body, load_registration, registered_digest, work_capture
 from capture4d.workdir import open_stage, require_complete
-from retarget.pose_normalisation import PoseRows
 from retarget.stage import GarmentModel, learned_frames, load_garment_model
 from wrinkles.apply_stage import generated_normals
 from wrinkles.config import PairConfig
@@ -46,9 +45,6 @@ from wrinkles.inference import load_model
 from wrinkles.map_metrics import angles, score
 from wrinkles.map_spaces import to_tangent
 from wrinkles.normal_maps import MapTemplate
-from wrinkles.offset_images import OffsetLayout, OffsetSampler
-from wrinkles.offset_networks import ImageDecoder, PcaFullyConnected
-from wrinkles.offset_training import OffsetConfig, OffsetFrames, offset_frames, pose_joints, predict, train_offsets
 from wrinkles.pair_files import layout_digest, load_pairs, pair_template
 from wrinkles.pair_stage import ensure_pairs
 from wrinkles.pairs import PairTake, split
@@ -59,7 +55,6 @@ __all__ = ["run"]
 SCHEMA = 3
 ERROR_DEG = 30.0
 """Normal error at which the strip's colours saturate."""
-MB = 1e6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -146,25 +141,20 @@ def run(
     if known is not None and moving is not None:
         modelled = model_take(known, sequence, *moving, rows)
         seen = any(not set(rows).isdisjoint(part) for part in learned_frames(known.folder, upstream["registration"]))
-        methods += [
-            _drawn_by(
-                each.name, template, each.vertices, template.low_normals, each.megabytes,
-                extra_ms=each.ms_per_frame, has_map=False, learned=seen,
-            )
-            for each in modelled.surfaces
-        ]  # fmt: skip
+        methods += [_without_map(each, template, learned=seen) for each in modelled.surfaces]
     seams, its_own = seam_table(template.mesh, template.raster), template.referred_to(generator.reference)
     methods.append(
         _drawn_by(
             "network", template, methods[0].vertices,
             lambda vertices: generated_normals(generator, its_own, seams, vertices),
-            _megabytes(generator.generator),
+            megabytes(generator.generator),
         )
     )  # fmt: skip
     if moving is not None and sequence.garment.skin_weights is not None:
         failed = failed_frames(work)
         sound = [frame_id for frame_id in learned.frame_ids.tolist() if frame_id not in failed]
-        methods += _offset_methods(template, sequence, *moving, rows, _rows(sequence, sound, work), config)
+        surfaces = offset_surfaces(sequence, *moving, rows, _rows(sequence, sound, work), config)
+        methods += [_without_map(each, template) for each in surfaces]
     truth = _true_vertices(capture, held.frame_ids)
     table = [_measure(method, template, held, truth, methods[0]) for method in methods]
     chosen = np.unique(np.linspace(0, len(held.frame_ids) - 1, min(config.pictures, len(rows))).astype(int))
@@ -280,6 +270,13 @@ def _registered(template: MapTemplate, sequence: RegisteredSequence, rows: Seque
     return _drawn_by("registration", template, vertices, template.low_normals, 0.0, has_map=False)
 
 
+def _without_map(surface: ModelledSurface, template: MapTemplate, *, learned: bool = False) -> _Method:
+    return _drawn_by(
+        surface.name, template, surface.vertices, template.low_normals, surface.megabytes,
+        extra_ms=surface.ms_per_frame, has_map=False, learned=learned,
+    )  # fmt: skip
+
+
 def _drawn_by(
     name: str,
     template: MapTemplate,
@@ -297,63 +294,6 @@ def _drawn_by(
         maps.append(normals(placed))
         times.append(1e3 * (time.perf_counter() - begin))
     return _Method(name, vertices, np.stack(maps), float(np.median(times)) + extra_ms, megabytes, has_map, learned)
-
-
-def _offset_methods(
-    template: MapTemplate,
-    sequence: RegisteredSequence,
-    body: Body,
-    poses: PoseSequence,
-    rows: Sequence[int],
-    learned: Sequence[int],
-    config: CompareConfig,
-) -> list[_Method]:
-    """Learn decoder and baseline on some frames, of which the last ninth stops them, and predict the held-out ones.
-
-    Raises:
-        InputError: there are not two frames to learn from.
-    """
-    if len(learned) < 2:
-        raise InputError(f"compare: expected at least 2 soundly registered frames to learn from, found {len(learned)}")
-    garment, size = sequence.garment, config.image_texels
-    assert garment.skin_weights is not None
-    ordered = PoseRows.match(sequence, with_shape(body, poses.shape), poses).poses
-    joints = pose_joints(ordered, garment.skin_weights)
-    layout = OffsetLayout.create(garment, size)
-    frames = offset_frames(layout, body, ordered, np.array(sequence.vertices), joints)
-    cut = len(learned) - max(len(learned) // 9, 1)
-    parts = frames.rows(list(learned[:cut])), frames.rows(list(learned[cut:]))
-    held, sampler = frames.rows(list(rows)), OffsetSampler(layout)
-    torch.manual_seed(0)
-    channels = max(size * 3 // 2, 2 ** (size.bit_length() - 4))
-    networks = {
-        "offset images": ImageDecoder(frames.pose.shape[1], channels=channels, doublings=size.bit_length() - 4),
-        "fully connected, PCA": PcaFullyConnected(frames.pose.shape[1], parts[0].offsets, components=128),
-    }
-    methods = []
-    for name, network in networks.items():
-        train_offsets(
-            network, layout, *parts, OffsetConfig(epochs=config.epochs, batch=min(16, max(4, len(parts[0]) // 8)))
-        )
-        made, ms = _predicted(network, sampler, held)
-        methods.append(
-            _drawn_by(name, template, made, template.low_normals, _megabytes(network), extra_ms=ms, has_map=False)
-        )
-    return methods
-
-
-def _predicted(network: torch.nn.Module, sampler: OffsetSampler, frames: OffsetFrames) -> tuple[np.ndarray, float]:
-    """Vertices, metres, and the median time of a frame alone, ms."""
-    made, times = [], []
-    for row in range(len(frames)):
-        begin = time.perf_counter()
-        made.append(predict(network, sampler, frames.rows([row]))[0].numpy() / 100)
-        times.append(1e3 * (time.perf_counter() - begin))
-    return np.stack(made), float(np.median(times))
-
-
-def _megabytes(network: torch.nn.Module) -> float:
-    return sum(each.numel() * each.element_size() for each in network.state_dict().values()) / MB
 
 
 def _true_vertices(capture: Capture, frame_ids: Sequence[int] | np.ndarray) -> np.ndarray | None:
