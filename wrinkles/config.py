@@ -137,6 +137,7 @@ class WrinkleConfig:
 _SMALL = WrinkleConfig(
     texels=128,
     network=NetworkConfig(filters=32, layers=7, output="residual", dropout=0.0),
+    loss=LossConfig(temporal_kind="l2"),
     schedule=ScheduleConfig(steps=4000, batch=4, learning_rate=4e-4, half_precision=True),
 )
 PRESETS: Mapping[str, WrinkleConfig] = {
