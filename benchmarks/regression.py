@@ -5,8 +5,9 @@ of 0.65, on shapes of its own; ours are in square millimetres. Beside the defaul
 layers, learned from the takes as they are, without noise on the controls, beside our ridge regression with an intercept
 of the same; one seed, from registered takes.
 
-`linear` learns from the takes as they are and in the mirror, as everything does by default; `linear_unmirrored` only
-as they are. The kernels see more than the paper's control vector (`KernelConfig.control`).
+`linear` learns from the takes as they are and in the mirror, as everything does by default; `linear_unmirrored` only as
+they are, and so does `linear_printed`, the paper's F = L T^+ without intercept and ridge. The kernels see more than the
+paper's control vector (`KernelConfig.control`). `ensemble`, the default of `animate`, is the mean of kernels and LSTM.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from benchmarks.learning_takes import Lesson, lesson, training_set
 from benchmarks.metric import Metric
 from retarget.config import FitConfig, LstmConfig, TrainingConfig
 from retarget.controls import ControlLayout
+from retarget.ensemble import ensemble
 from retarget.kernel import fit_kernel
 from retarget.learning import Projected, fitting_clips, learn_shapes, predictions, regression_clips, vertex_error_m
 from retarget.linear import LinearRegressor, fit_linear
@@ -93,11 +95,12 @@ def _methods(taken: Lesson, config: FitConfig, seeds: int) -> list[Metric]:
     mirror = find_mirror(rest, taken.person.body.joint_names, config.mirror)
     clips = fitting_clips(takes, pieces, layout, space, mirror, projected)
     linear = fit_linear(clips, layout, space.std, config.linear)
-    unmirrored = fit_linear(
-        fitting_clips(takes, pieces, layout, space, None, projected), layout, space.std, config.linear
-    )
+    as_they_are = fitting_clips(takes, pieces, layout, space, None, projected)
+    unmirrored = fit_linear(as_they_are, layout, space.std, config.linear)
+    printed = fit_linear(as_they_are, layout, space.std, replace(config.linear, fit="moore-penrose"))
     kernel = fit_kernel(fitting_clips(takes, pieces, own, space, mirror, projected), own, space.std, config.kernel)
     networks = [_network(clips, layout, space.std, linear, config, seed) for seed in range(seeds)]
+    together = [each for each in (ensemble(kernel, network) for network in networks) if each is not None]
     metrics = [Metric("directions", float(len(space.std))), Metric("control_numbers", float(layout.size))]
     for name, examined in (("", pieces), ("reversed_", taken.reversed)):
         held_out, seen_more = (
@@ -106,10 +109,12 @@ def _methods(taken: Lesson, config: FitConfig, seeds: int) -> list[Metric]:
         said = {
             "mean": [[np.zeros_like(clip.coefficients) for clip in held_out]],
             "nearest": [_nearest(taken, examined, layout, plain)],
+            "linear_printed": [predictions(printed, held_out)],
             "linear_unmirrored": [predictions(unmirrored, held_out)],
             "linear": [predictions(linear, held_out)],
             "lstm": [predictions(network, held_out) for network in networks],
             "kernel": [predictions(kernel, seen_more)],
+            "ensemble": [predictions(each, seen_more) for each in together],
         }
         errors: dict[str, tuple[float, float]] = {}
         for method, tries in said.items():
@@ -118,13 +123,16 @@ def _methods(taken: Lesson, config: FitConfig, seeds: int) -> list[Metric]:
             errors[method] = mse, off
             metrics.append(Metric(f"{name}{method}_coefficient_mse_mm2", 1e6 * mse, "mm2"))
             metrics.append(Metric(f"{name}{method}_vertex_mm", 1e3 * off, "mm"))
-        for method in ("lstm", "kernel"):
-            for other in ("linear", "linear_unmirrored"):
+        for method in ("lstm", "kernel", "ensemble"):
+            for other in ("linear", "linear_unmirrored", "linear_printed"):
                 for kind, which in (("mse", 0), ("vertex", 1)):
                     ratio = errors[method][which] / errors[other][which]
                     metrics.append(Metric(f"{name}{method}_to_{other}_{kind}", ratio))
         if not name:
-            drifts = [*(_drift(network, held_out[0]) for network in networks), _drift(kernel, seen_more[0])]
+            drifts = [
+                *(_drift(network, held_out[0]) for network in networks),
+                *(_drift(each, seen_more[0]) for each in together),
+            ]
             metrics.append(Metric(f"drift_{FREE_FRAMES}_frames", max(drifts)))
     return metrics
 

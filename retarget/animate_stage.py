@@ -32,7 +32,7 @@ from retarget.animation import AnimatedFrame, Animator
 from retarget.bodies import captured_person, require_skeleton, retargeted_mean
 from retarget.config import AnimateConfig
 from retarget.controls import control_vectors
-from retarget.stage import GarmentModel, load_garment_model
+from retarget.stage import GarmentModel, load_garment_model, regressor_files
 
 __all__ = ["run"]
 
@@ -84,7 +84,7 @@ def run(
     upstream = {
         "model": known.digest,
         "poses": file_digest([poses], root=poses.parent),
-        "regressor": file_digest([known.folder / f"{name}.safetensors"], root=known.folder),
+        "regressor": file_digest(regressor_files(known.folder, name), root=known.folder),
     }
     if coefficients is not None:
         expected = (len(motion.frame_ids), len(known.model.std))
@@ -126,9 +126,7 @@ def run(
 
 def _model(path: Path, config: AnimateConfig, device: str) -> tuple[GarmentModel, str]:
     """The model, and which of its regressors is meant; torch is loaded only for the LSTM."""
-    known = load_garment_model(path, device=device, with_lstm=config.regressor == "lstm")
-    if config.regressor == "auto" and known.kernel is None:
-        known = load_garment_model(path, device=device)
+    known = load_garment_model(path, device=device, with_lstm=config.regressor in ("auto", "ensemble", "lstm"))
     found = list(known.regressors)
     name = found[-1] if config.regressor == "auto" else config.regressor
     if name not in found:

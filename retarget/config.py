@@ -220,8 +220,8 @@ class RemovalConfig:
 class AnimateConfig:
     """Putting a learned garment on a motion and a body."""
 
-    regressor: Literal["auto", "kernel", "lstm", "linear"] = "auto"
-    """`auto`: the kernels if the model has them, otherwise the LSTM, otherwise the linear regression."""
+    regressor: Literal["auto", "ensemble", "kernel", "lstm", "linear"] = "auto"
+    """`auto`: the first of these that the model has. `ensemble` is the mean of kernels and LSTM."""
     mean: Literal["corrected", "printed", "captured"] = "corrected"
     """How the mean meets another body: moved by the difference of the two bodies (Eq. 5, corrected), by the new body's
     whole offset from the average person (as printed), or not at all."""

@@ -14,7 +14,7 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64, Int32
+from jaxtyping import Float, Float32, Float64, Int32, Int64
 from scipy.spatial.transform import Rotation
 
 from capture4d.errors import InputError
@@ -78,16 +78,32 @@ class ControlLayout:
     @property
     def kinds(self) -> tuple[int, ...]:
         """How many numbers there are of each unit: rotations, velocity, acceleration, gravity, turning, lags."""
+        return tuple(size for _, size in self._parts)
+
+    @property
+    def _parts(self) -> list[tuple[tuple[str, int], int]]:
+        """What stands in a control vector, in order: each name with the setting that decides it, how many numbers."""
         config, rotations = self.config, 6 * len(self.joints)
-        counts = (
-            *[rotations] * self.rotation_sets,
-            3 * config.root_motion,
-            3 * config.root_motion,
-            3 * config.up,
-            3 * (len(self.joints) + 1) * config.joint_velocity,
-            *[rotations * self.rotation_sets] * len(config.lags),
-        )
-        return tuple(count for count in counts if count)
+        parts = [(("rotations", 0), rotations)]
+        if config.whole_rotations:
+            parts.append((("whole rotations", 0), rotations))
+        if config.root_motion:
+            parts += [((name, config.derivative_frames), 3) for name in ("velocity", "acceleration")]
+        if config.up:
+            parts.append((("up", 0), 3))
+        if config.joint_velocity:
+            parts.append((("turning", 0), 3 * (len(self.joints) + 1)))
+        lagging = "lag" if not config.whole_rotations else "lag with whole rotations"
+        return [*parts, *(((lagging, lag), rotations * self.rotation_sets) for lag in config.lags)]
+
+    def columns_of(self, other: ControlLayout) -> Int64[np.ndarray, " controls"] | None:
+        """Where another layout's controls stand in these; None: they are not all here."""
+        if (self.joint_names, self.joints, self.fps) != (other.joint_names, other.joints, other.fps):
+            return None
+        starts = dict(zip((name for name, _ in self._parts), np.cumsum([0, *self.kinds]).tolist(), strict=False))
+        if any(name not in starts for name, _ in other._parts):
+            return None
+        return np.concatenate([starts[name] + np.arange(size) for name, size in other._parts])
 
     def require(self, poses: PoseSequence) -> None:
         """

@@ -37,6 +37,7 @@ from capture4d.workers import run_jobs
 from retarget.blendshapes import ShapeSpace, as_model_arrays, shape_space, worst_errors
 from retarget.config import FitConfig, check_fit
 from retarget.controls import ControlLayout
+from retarget.ensemble import ensemble
 from retarget.kernel import KernelRegressor, fit_kernel, load_kernel, save_kernel
 from retarget.learning import (
     Projected,
@@ -306,20 +307,19 @@ def _regressors(
     lesson = fitting_clips(takes, pieces, layout, space, mirror, projected)
     linear = fit_linear(lesson, layout, space.std, config.linear)
     save_linear(stage.path / LINEAR, linear, model_digest=digest)
-    regressors: dict[str, Regressor] = {"linear": linear}
+    kernel = network = None
     if config.regressor != "linear":
         own = ControlLayout.create(body, takes.skin_weights, layout.fps, config.kernel.control)
         kernel = fit_kernel(fitting_clips(takes, pieces, own, space, mirror, projected), own, space.std, config.kernel)
         save_kernel(stage.path / KERNEL, kernel, model_digest=digest)
-        regressors["kernel"] = kernel
     if config.regressor == "all":
-        regressors["lstm"] = _network(stage, lesson, layout, space, linear, config, device, digest)
+        network = _network(stage, lesson, layout, space, linear, config, device, digest)
     note: dict[str, Any] = {
         "mirrored": mirror is not None,
         "control_numbers": layout.size,
         "joints": [layout.joint_names[j] for j in layout.joints],
     }
-    for name, regressor in regressors.items():
+    for name, regressor in _by_name(linear, network, kernel).items():
         note[name] = {"ridge": regressor.ridge} if isinstance(regressor, (LinearRegressor, KernelRegressor)) else {}
         for role in ROLES:
             known = regression_clips(takes, pieces, role, regressor.layout, space, None, projected)
@@ -380,12 +380,24 @@ class GarmentModel:
     @property
     def regressors(self) -> dict[str, Regressor]:
         """Those that the model has, by name; the best last."""
-        found = {"linear": self.linear, "lstm": self.lstm, "kernel": self.kernel}
-        return {name: each for name, each in found.items() if each is not None}
+        return _by_name(self.linear, self.lstm, self.kernel)
 
     @property
     def best(self) -> Regressor:
         return list(self.regressors.values())[-1]
+
+
+def _by_name(linear: LinearRegressor, lstm: Regressor | None, kernel: KernelRegressor | None) -> dict[str, Regressor]:
+    """The regressors that there are; the best last."""
+    both = None if lstm is None or kernel is None else ensemble(kernel, lstm)
+    found = {"linear": linear, "lstm": lstm, "kernel": kernel, "ensemble": both}
+    return {name: each for name, each in found.items() if each is not None}
+
+
+def regressor_files(folder: Path, name: str) -> list[Path]:
+    """What a regressor of a model consists of."""
+    files = {"ensemble": (LINEAR, LSTM, KERNEL), "kernel": (KERNEL,), "lstm": (LINEAR, LSTM), "linear": (LINEAR,)}
+    return [folder / file for file in files[name]]
 
 
 def load_garment_model(path: Path, *, device: str = "cpu", with_lstm: bool = True) -> GarmentModel:

@@ -4,7 +4,7 @@ compare.json holds the table and names the pictures, which pictures/ keeps for t
 
 registration        the template as registered, without a map
 blendshapes         the registration, projected on a learned garment's principal directions
-regression          the learned garment from the poses alone: linear, by the LSTM, by kernels
+regression          the learned garment from the poses alone: linear, by the LSTM, by kernels, by both of these
 network             the registration with maps made by a trained generator
 offset images       vertices decoded from an image that a network predicts from the pose alone, learned here
 fully connected     the same with a fully connected network on principal components

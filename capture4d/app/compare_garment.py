@@ -18,13 +18,13 @@ from retarget.bodies import captured_person, retargeted_mean
 from retarget.config import AnimateConfig, ShapeConfig
 from retarget.controls import control_vectors
 from retarget.pose_normalisation import PoseRows, unpose_sequence
-from retarget.stage import GarmentModel
+from retarget.stage import GarmentModel, regressor_files
 
 __all__ = ["PEOPLE", "Dressed", "Modelled", "ModelledSurface", "model_take"]
 
 PEOPLE: Mapping[str, tuple[float, ...] | None] = {"as captured": None, **OTHER_BODIES}
 """Whom the garment is shown on: first coefficients of their shape."""
-_IN_WORDS = {"linear": "linear", "lstm": "LSTM", "kernel": "kernels"}
+_IN_WORDS = {"linear": "linear", "lstm": "LSTM", "kernel": "kernels", "ensemble": "kernels and LSTM"}
 MB = 1e6
 
 
@@ -112,7 +112,7 @@ def model_take(
             said.append(stream.push(each))
             times.append(1e3 * (time.perf_counter() - begin))
         coefficients, ms = np.stack(said), float(np.median(times))
-        size = (known.folder / f"{name}.safetensors").stat().st_size
+        size = sum(path.stat().st_size for path in regressor_files(known.folder, name))
         answers[f"regression, {_IN_WORDS[name]}"] = coefficients[list(rows)], ms, size
     mean = retargeted_mean(model, person, matched.shaped).astype(np.float32)  # on the person as this take was tracked
     surfaces = []

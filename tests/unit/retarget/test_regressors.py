@@ -20,6 +20,7 @@ from capture4d.tensor_files import read_tensors, write_tensors
 from capture4d.types import PoseSequence
 from retarget.config import ControlConfig, KernelConfig, LinearConfig, LstmConfig, TrainingConfig
 from retarget.controls import ControlLayout, control_vectors
+from retarget.ensemble import ensemble
 from retarget.kernel import fit_kernel, load_kernel, save_kernel
 from retarget.linear import fit_linear, load_linear, save_linear
 from retarget.lstm import EncoderDecoder, LstmRegressor, load_lstm, save_lstm
@@ -32,7 +33,7 @@ QUICK = TrainingConfig(epochs=6, batch=16, patience=10)
 
 
 def layout(**settings) -> ControlLayout:
-    return ControlLayout(NAMES, (1, 2), 60.0, ControlConfig(**settings))
+    return ControlLayout(NAMES, (1, 2), 60.0, ControlConfig(**settings), (-1, 0, 1))
 
 
 @pytest.fixture
@@ -118,6 +119,45 @@ def test_streaming_equals_batch(clips, kind: str, history: int, tmp_path: Path) 
     stream = found.stream()
     again = np.stack([stream.push(row) for row in known[3].controls])
     np.testing.assert_allclose(again, whole, atol=1e-5 * np.abs(whole).max())
+
+
+def test_kernels_and_network_are_one_that_sees_the_controls_of_both(motion, clips, tmp_path: Path) -> None:
+    wide = layout(whole_rotations=True, lags=(6, 18))
+    known, plain = clips(chosen=wide), clips()
+    kernel = fit_kernel(FittingClips.create(known), wide, spread(known), KernelConfig())
+    network = train_lstm(plain, (), layout(), spread(plain), tmp_path, lstm=SMALL, config=QUICK)
+    both = ensemble(kernel, network)
+    assert both is not None
+    wanted = 0.75 * kernel.predict(known[3].controls) + 0.25 * network.predict(plain[3].controls)
+    np.testing.assert_allclose(both.predict(known[3].controls), wanted, atol=1e-6)
+    stream = both.stream()
+    again = np.stack([stream.push(row) for row in known[3].controls])
+    np.testing.assert_allclose(again, wanted, atol=1e-5 * np.abs(wanted).max())
+
+
+@pytest.mark.parametrize(
+    ("wide", "narrow", "found"),
+    [
+        ({"lags": (2, 5), "up": True}, {"lags": (5,)}, True),
+        ({"whole_rotations": True, "joint_velocity": True}, {"joint_velocity": True, "root_motion": False}, True),
+        ({"lags": (2,)}, {"lags": (3,)}, False),
+        ({"whole_rotations": True, "lags": (2,)}, {"lags": (2,)}, False),  # its lags have twice the numbers
+        ({"derivative_frames": 5}, {"derivative_frames": 3}, False),
+        ({"root_motion": False}, {}, False),
+    ],
+)
+def test_controls_are_found_in_a_wider_layout(motion, wide, narrow, found: bool) -> None:
+    poses = motion(30, 0)
+    columns = layout(**wide).columns_of(layout(**narrow))
+    assert (columns is not None) == found
+    if columns is not None:
+        all_of_them = control_vectors(layout(**wide), poses)
+        np.testing.assert_array_equal(all_of_them[:, columns], control_vectors(layout(**narrow), poses))
+
+
+def test_controls_of_other_joints_or_another_rate_are_not_found() -> None:
+    for other in (replace(layout(), joints=(1,)), replace(layout(), fps=30.0)):
+        assert layout().columns_of(other) is None
 
 
 def test_what_training_sees_of_the_frames_before_is_what_a_stream_carries_on(clips) -> None:

@@ -91,6 +91,7 @@ def test_fit_finds_the_waves_and_says_so(model: Path, works, make_world) -> None
     assert note["lstm"]["validation"]["vertex_error_mm"] > 0
     assert (model / "training" / "metrics.jsonl").read_text().count("\n") == 3
     assert note["kernel"]["validation"]["vertex_error_mm"] > 0
+    assert note["ensemble"]["validation"]["vertex_error_mm"] > 0
     assert not (model / "unposed").exists()
 
 
