@@ -12,6 +12,8 @@ metrics/000123.json   share of the texels that are known, and the angle between 
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -57,12 +59,10 @@ def run(
         InputError: the work folder lacks its registration or its scans' garments, the template has no usable UVs, or
             the pairs to borrow from are of another template or other frames.
     """
+    _check(config)
     if high_from is not None:
         return _borrow(work, high_from, config, overwrite=overwrite)
-    upstream = {
-        "registration": registered_digest(work),
-        "garment": require_complete(work / "garment", "extract", f"capture4d extract CAPTURE --output {work}"),
-    }
+    upstream = _inputs(work)
     fps = work_capture(work).fps
     template = _template(work, config)
     sequence = load_registration(work / "registration")
@@ -71,14 +71,14 @@ def run(
     if not (output / "template.npz").is_file():
         save_garment(output / "template.npz", replace(sequence.garment, template=template.mesh))
     frame_ids = sequence.frame_ids.tolist()
-    pending = set(stage.pending(frame_ids, ".png", folder="high"))
+    pending = set(_pending(stage, frame_ids))
     runs = [range(start, min(start + RUN_FRAMES, len(frame_ids))) for start in range(0, len(frame_ids), RUN_FRAMES)]
     jobs = [
         _Run(work, stage, fps, positions) for positions in runs if pending.intersection(frame_ids[p] for p in positions)
     ]
 
     def finished() -> int:
-        return len(frame_ids) - len(stage.pending(frame_ids, ".png", folder="high"))
+        return len(frame_ids) - len(_pending(stage, frame_ids))
 
     make = partial(_make, config)
     for _ in run_jobs(make, jobs, workers=workers, label="normal maps", units=_length, finished=finished):
@@ -90,11 +90,7 @@ def run(
 
 def _borrow(work: Path, lender: Path, config: PairConfig, *, overwrite: bool) -> str:
     """Pairs of this sequence's low maps with another's high maps; the frames that both have."""
-    pairs = lender / "wrinkles" / "pairs"
-    upstream = {
-        "registration": registered_digest(work),
-        "pairs": require_complete(pairs, "pairs", f"capture4d wrinkles maps {lender}"),
-    }
+    pairs, upstream = lender / "wrinkles" / "pairs", _lent(work, lender)
     sequence, theirs = load_registration(work / "registration"), load_registration(lender / "registration")
     template = MapTemplate.create(sequence.garment, config.map)
     lent = load_garment(pairs / "template.npz").template
@@ -113,7 +109,7 @@ def _borrow(work: Path, lender: Path, config: PairConfig, *, overwrite: bool) ->
     if not (output / "template.npz").is_file():
         referred = template.mesh.with_vertices(template.reference)
         save_garment(output / "template.npz", replace(sequence.garment, template=referred))
-    pending = set(stage.pending([frame_id for _, frame_id in shared], ".png", folder="high"))
+    pending = set(_pending(stage, [frame_id for _, frame_id in shared]))
     shown = template.raster.image(np.ones(len(template.raster.inside), bool))
     for row, frame_id in shared:
         if frame_id not in pending:
@@ -133,12 +129,58 @@ def _borrow(work: Path, lender: Path, config: PairConfig, *, overwrite: bool) ->
 
 
 def ensure_pairs(work: Path, config: PairConfig, *, workers: int = 1) -> None:
-    """Make a work folder's pairs, unless it has finished ones of its present registration, whatever their settings."""
+    """Make a work folder's pairs, unless it has finished ones of its present inputs, whatever their settings.
+
+    Raises:
+        InputError: an input is missing, or it is not what the pairs were made from.
+    """
     record_path = work / "wrinkles" / "pairs" / "stage.json"
     record = read_json(record_path) if record_path.is_file() else {}
-    finished = record.get("status") == "complete"
-    if not finished or record.get("upstream", {}).get("registration") != registered_digest(work):
+    made_from = record.get("upstream", {})
+    if "pairs" in made_from:
+        lender = Path(record["sources"]["pairs"]).parents[1]
+        if _lent(work, lender) == made_from and record["status"] == "complete":
+            return
+        run(work, config, high_from=lender, workers=workers)
+    elif record.get("status") != "complete" or made_from != _inputs(work):
         run(work, config, workers=workers)
+
+
+def _inputs(work: Path) -> dict[str, str]:
+    """Digests of what pairs of a take's own scans are made from."""
+    return {
+        "registration": registered_digest(work),
+        "garment": require_complete(work / "garment", "extract", f"capture4d extract CAPTURE --output {work}"),
+    }
+
+
+def _lent(work: Path, lender: Path) -> dict[str, str]:
+    """Digests of what borrowed pairs are made from."""
+    return {
+        "registration": registered_digest(work),
+        "pairs": require_complete(lender / "wrinkles" / "pairs", "pairs", f"capture4d wrinkles maps {lender}"),
+    }
+
+
+def _pending(stage: Stage, frame_ids: Sequence[int]) -> list[int]:
+    """Frames that lack one map or the other."""
+    missing = {frame_id for folder in ("low", "high") for frame_id in stage.pending(frame_ids, ".png", folder=folder)}
+    return [frame_id for frame_id in frame_ids if frame_id in missing]
+
+
+def _check(config: PairConfig) -> None:
+    for name, value, least in (
+        ("map.size", config.map.size, 1),
+        ("map.padding", config.map.padding, 0),
+        ("projection.border_rings", config.projection.border_rings, 0),
+        ("projection.smoothing_passes", config.projection.smoothing_passes, 0),
+        ("projection.distance_m", config.projection.distance_m, 0),
+        ("projection.angle_deg", config.projection.angle_deg, 0),
+        ("projection.temporal_span_s", config.projection.temporal_span_s, 0),
+        ("projection.blur_texels", config.projection.blur_texels, 0),
+    ):
+        if not (math.isfinite(value) and value >= least):
+            raise InputError(f"{name}: expected a number, at least {least}, found {value:g}")
 
 
 def _length(job: _Run) -> int:
@@ -156,7 +198,7 @@ def _make(config: PairConfig, job: _Run) -> int:
     template = _template(job.work, config)
     sequence = load_registration(job.work / "registration")
     frame_ids, failed = sequence.frame_ids.tolist(), failed_frames(job.work)
-    pending = set(job.stage.pending([frame_ids[p] for p in job.positions], ".png", folder="high"))
+    pending = set(_pending(job.stage, [frame_ids[p] for p in job.positions]))
     missing = [position for position in job.positions if frame_ids[position] in pending]
 
     def scan(position: int) -> Mesh | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,6 +36,12 @@ class PairTake:
         steps = np.diff(self.frame_ids)
         known = self.valid.flatten(1).any(dim=1).numpy()
         return 1 + np.flatnonzero((steps == steps.min()) & known[1:] & known[:-1])
+
+    def without(self, frame_ids: Collection[int]) -> PairTake:
+        """All frames but these."""
+        kept = ~np.isin(self.frame_ids, list(frame_ids))
+        at = torch.from_numpy(kept)
+        return PairTake(self.name, self.frame_ids[kept], self.low[at], self.high[at], self.valid[at])
 
     def part(self, positions: range) -> PairTake:
         """Some frames in a row."""

@@ -6,6 +6,7 @@ checkpoints/000500.safetensors   everything a resume needs; the last two are kep
 metrics.jsonl              losses, one line every `log_every` steps
 samples/000500.png         held-out frames: input, made, true
 held_out.json              measures on the held-out frames: of the maps made, and of the low maps
+takes.json                 digests of the registrations it learned from
 """
 
 from __future__ import annotations
@@ -20,10 +21,11 @@ import safetensors.torch
 import torch
 from safetensors import SafetensorError
 
-from capture4d.atomic_files import read_json_lines, write_bytes, write_json
+from capture4d.atomic_files import read_json, read_json_lines, write_bytes, write_json
 from capture4d.errors import InputError
 from capture4d.types import Mesh
 from capture4d.uv_layout import millimetres_per_texel
+from capture4d.work_folder import registered_digest
 from capture4d.workdir import Stage, open_stage, require_complete
 from capture4d.workers import progress
 from wrinkles.config import PairConfig, WrinkleConfig
@@ -36,9 +38,10 @@ from wrinkles.pair_stage import run as make_pairs
 from wrinkles.pairs import PairTake, batches, consecutive_pairs, fitted, split
 from wrinkles.training import TrainingState, load_tensors, new_state, state_tensors, train_step
 
-__all__ = ["run", "score_take"]
+__all__ = ["learned_takes", "run", "score_take"]
 
 SCHEMA = 1
+TAKES = "takes.json"
 KEPT_CHECKPOINTS = 2
 SAMPLES = 4
 LOGGED = "logged."
@@ -93,6 +96,7 @@ def run(
     stage = open_stage(
         output, name="train-wrinkles", schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite
     )
+    write_json(stage.path / TAKES, {work.name: registered_digest(work) for work in works})
     recent = _resume(stage, state)
     _train(stage, state, recent, [train for train, _ in parts], [held for _, held in parts], config)
     model = WrinkleModel(
@@ -106,6 +110,12 @@ def run(
             measured[held.name] = {"made": _json(made), "low": _json(low)}
     write_json(stage.path / "held_out.json", measured)
     return stage.finish([stage.path / "generator.safetensors"])
+
+
+def learned_takes(model: Path) -> set[str]:
+    """Digests of the registrations that a trained network learned from."""
+    path = model / TAKES
+    return set(read_json(path).values()) if path.is_file() else set()
 
 
 def _check(config: WrinkleConfig) -> None:
@@ -123,6 +133,12 @@ def _check(config: WrinkleConfig) -> None:
     for name, value in counts.items():
         if value < 1:
             raise InputError(f"{name}: expected at least 1, found {value}")
+    if config.held_out_gap < 0:
+        raise InputError(f"held_out_gap: expected at least 0, found {config.held_out_gap}")
+    if not schedule.learning_rate > 0:
+        raise InputError(f"schedule.learning_rate: expected a positive rate, found {schedule.learning_rate:g}")
+    if not 0 <= schedule.beta1 < 1:
+        raise InputError(f"schedule.beta1: expected a number from 0 to below 1, found {schedule.beta1:g}")
     if not 0 <= config.held_out < 1:
         raise InputError(f"held_out: expected a share from 0 to below 1, found {config.held_out:g}")
 

@@ -129,7 +129,10 @@ def _dispatch(arguments: list[str]) -> int:
         near = difflib.get_close_matches(name, _COMMANDS, n=1)
         hint = f"; did you mean '{near[0]}'?" if near else ""
         return _complain(f"unknown command '{name}'{hint} (see capture4d --help)", code=2)
-    return _parse(name, rest)()
+    command = _parse(name, rest)
+    if getattr(command, "workers", 1) < 1:
+        raise InputError(f"--workers: expected at least 1, found {command.workers}")
+    return command()
 
 
 def _parse(name: str, arguments: list[str]) -> Any:

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -28,16 +28,28 @@ from capture4d.app.compare_config import CompareConfig
 from capture4d.app.compare_garment import Modelled, ModelledSurface, model_take
 from capture4d.app.compare_offsets import megabytes, offset_surfaces
 from capture4d.app.render import Drawn, heat_colours, render
-from capture4d.app.report_pictures import CLOTH, HEIGHT, SKIN, WIDTH, Framing, Panel, colour_bar, data_uri, write_panel
+from capture4d.app.report_pictures import (
+    CLOTH,
+    HEIGHT,
+    SKIN,
+    WIDTH,
+    Framing,
+    Panel,
+    colour_bar,
+    data_uri,
+    no_scan,
+    readable_scan,
+    write_panel,
+)
 from capture4d.atomic_files import file_digest, read_json, write_bytes, write_json
 from capture4d.errors import InputError
 from capture4d.evaluation import correspondence_errors, material_points
-from capture4d.scans import Capture, read_scan, read_truth_model, read_truth_vertices
+from capture4d.scans import Capture, read_truth_model, read_truth_vertices
 from capture4d.types import RegisteredSequence
 from capture4d.uv_layout import millimetres_per_texel
 from capture4d.work_folder import failed_frames, find_moving_body, load_registration, registered_digest, work_capture
 from capture4d.workdir import open_stage, require_complete
-from retarget.stage import GarmentModel, learned_frames, load_garment_model
+from retarget.stage import GarmentModel, learned_frames, load_garment_model, regressor_files
 from wrinkles.apply_stage import generated_normals
 from wrinkles.config import PairConfig
 from wrinkles.display import fill_holes
@@ -45,14 +57,17 @@ from wrinkles.inference import load_model
 from wrinkles.map_metrics import angles, score
 from wrinkles.map_spaces import to_tangent
 from wrinkles.normal_maps import MapTemplate
-from wrinkles.pair_files import layout_digest, load_pairs, pair_template
+from wrinkles.pair_files import layout_digest, load_pairs, map_settings, pair_template
 from wrinkles.pair_stage import ensure_pairs
 from wrinkles.pairs import PairTake, split
 from wrinkles.seams import seam_table
+from wrinkles.train_stage import learned_takes
 
 __all__ = ["run"]
 
-SCHEMA = 3
+SCHEMA = 4
+NETWORK = "network"
+"""The registration with the network's map."""
 ERROR_DEG = 30.0
 """Normal error at which the strip's colours saturate."""
 
@@ -115,7 +130,17 @@ def run(
         "model": file_digest([weights], root=weights.parent),
     }
     if known is not None:
+        files = {path for name in known.regressors for path in regressor_files(known.folder, name)}
         upstream["garment model"] = known.digest
+        upstream["regressors"] = file_digest(sorted(files), root=known.folder)
+    capture, sequence = work_capture(work), load_registration(work / "registration")
+    template = MapTemplate.create(sequence.garment, generator.maps).referred_to(pair_template(work).vertices)
+    if layout_digest(template.mesh, generator.maps.size) != generator.layout_digest:
+        raise InputError(f"{work}: expected the template that {weights} was trained on, found another")
+    if layout_digest(pair_template(work), map_settings(work).size) != generator.layout_digest:
+        raise InputError(f"{work / 'wrinkles' / 'pairs'}: expected maps laid out as {weights} has them "
+                         f"({generator.maps}), found {map_settings(work)}")  # fmt: skip
+    held_out, gap = _network_split(weights, work, upstream, config)
     stage = open_stage(
         work / "compare", name="compare", schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite
     )
@@ -124,16 +149,11 @@ def run(
         stage.finish([page_path])
         return page_path
     torch.set_num_threads(workers)
-    capture, sequence = work_capture(work), load_registration(work / "registration")
-    template = MapTemplate.create(sequence.garment, generator.maps).referred_to(pair_template(work).vertices)
-    if layout_digest(template.mesh, generator.maps.size) != generator.layout_digest:
-        raise InputError(f"{work}: expected the template that {weights} was trained on, found another")
-    pairs = load_pairs(work)
-    if pairs.low.shape[-1] != generator.maps.size:
-        raise InputError(f"{work}: expected pairs of {generator.maps.size} texels, as {weights} has them, found "
-                         f"{pairs.low.shape[-1]}")  # fmt: skip
-    held_out, gap = _network_split(weights, work, upstream["pairs"], config)
-    learned, held = split(pairs, held_out=held_out, gap=gap)
+    failed = failed_frames(work)
+    learned, held = split(load_pairs(work), held_out=held_out, gap=gap)
+    held = held.without(failed)
+    if not len(held.frame_ids):
+        raise InputError(f"{work}: expected held-out frames whose scans can be read, found none")
     rows = _rows(sequence, held.frame_ids, work)
     methods = [_registered(template, sequence, rows)]
     moving = find_moving_body(work)
@@ -143,15 +163,13 @@ def run(
         seen = any(not set(rows).isdisjoint(part) for part in learned_frames(known.folder, upstream["registration"]))
         methods += [_without_map(each, template, learned=seen) for each in modelled.surfaces]
     seams, its_own = seam_table(template.mesh, template.raster), template.referred_to(generator.reference)
-    methods.append(
-        _drawn_by(
-            "network", template, methods[0].vertices,
-            lambda vertices: generated_normals(generator, its_own, seams, vertices),
-            megabytes(generator.generator),
-        )
-    )  # fmt: skip
+
+    def mapped(vertices: np.ndarray) -> np.ndarray:
+        return generated_normals(generator, its_own, seams, vertices)
+
+    size = megabytes(generator.generator)
+    methods.append(_drawn_by(NETWORK, template, methods[0].vertices, mapped, size, has_map=True))
     if moving is not None and sequence.garment.skin_weights is not None:
-        failed = failed_frames(work)
         sound = [frame_id for frame_id in learned.frame_ids.tolist() if frame_id not in failed]
         surfaces = offset_surfaces(sequence, *moving, rows, _rows(sequence, sound, work), config)
         methods += [_without_map(each, template) for each in surfaces]
@@ -161,7 +179,7 @@ def run(
     frames = [
         (
             int(held.frame_ids[at]),
-            _pictures(capture, template, methods, held, int(at)),
+            _pictures(capture, template, methods, held, int(at), mapped),
             _strip(template, methods, held, int(at)),
         )
         for at in chosen
@@ -229,27 +247,28 @@ def _garment_model(work: Path, path: Path | None) -> GarmentModel | None:
 
 
 def _check(config: CompareConfig) -> None:
-    for name, value in (("pictures", config.pictures), ("epochs", config.epochs)):
-        if value < 1:
-            raise InputError(f"{name}: expected at least 1, found {value}")
+    for name, value, least in (("pictures", config.pictures, 1), ("epochs", config.epochs, 1), ("gap", config.gap, 0)):
+        if value < least:
+            raise InputError(f"{name}: expected at least {least}, found {value}")
     if not 0 < config.held_out < 1:
         raise InputError(f"held_out: expected a share between 0 and 1, found {config.held_out:g}")
     if config.image_texels < 16 or config.image_texels & (config.image_texels - 1):
         raise InputError(f"image_texels: expected a power of two from 16 on, found {config.image_texels}")
 
 
-def _network_split(weights: Path, work: Path, pairs: str, config: CompareConfig) -> tuple[float, int]:
+def _network_split(weights: Path, work: Path, upstream: Mapping[str, str], config: CompareConfig) -> tuple[float, int]:
     """The frames a network has not seen: its own split where it learned from this take.
 
     Args:
-        pairs: digest of the take's pairs.
+        upstream: digests of the take's pairs and registration.
     """
     record_path = weights.parent / "stage.json"
     record = read_json(record_path) if record_path.is_file() else {}
     settings, takes = record.get("config", {}), record.get("upstream", {})
-    if settings.get("held_out", 0) > 0 and (pairs in takes.values() or work.resolve().name in takes):
+    learned = upstream["pairs"] in takes.values() or upstream["registration"] in learned_takes(weights.parent)
+    if settings.get("held_out", 0) > 0 and (learned or work.resolve().name in takes):
         return float(settings["held_out"]), int(settings["held_out_gap"])
-    if pairs in takes.values():
+    if learned:
         raise InputError(f"{weights}: expected a network that has not seen all frames of {work}, found one that "
                          "learned from it without held-out frames")  # fmt: skip
     return config.held_out, config.gap
@@ -267,13 +286,13 @@ def _rows(sequence: RegisteredSequence, frame_ids: Sequence[int] | np.ndarray, w
 
 def _registered(template: MapTemplate, sequence: RegisteredSequence, rows: Sequence[int]) -> _Method:
     vertices = np.array(sequence.vertices[list(rows)])
-    return _drawn_by("registration", template, vertices, template.low_normals, 0.0, has_map=False)
+    return _drawn_by("registration", template, vertices, template.low_normals, 0.0)
 
 
 def _without_map(surface: ModelledSurface, template: MapTemplate, *, learned: bool = False) -> _Method:
     return _drawn_by(
         surface.name, template, surface.vertices, template.low_normals, surface.megabytes,
-        extra_ms=surface.ms_per_frame, has_map=False, learned=learned,
+        extra_ms=surface.ms_per_frame, learned=learned,
     )  # fmt: skip
 
 
@@ -285,7 +304,7 @@ def _drawn_by(
     megabytes: float,
     *,
     extra_ms: float = 0.0,
-    has_map: bool = True,
+    has_map: bool = False,
     learned: bool = False,
 ) -> _Method:
     maps, times = [], []
@@ -343,30 +362,49 @@ def _number(value: float) -> float | None:
 
 
 def _pictures(
-    capture: Capture, template: MapTemplate, methods: Sequence[_Method], held: PairTake, at: int
+    capture: Capture,
+    template: MapTemplate,
+    methods: Sequence[_Method],
+    held: PairTake,
+    at: int,
+    mapped: Callable[[np.ndarray], np.ndarray],
 ) -> list[Panel]:
-    """The scan, the truth if there is one, every surface, with its map if it has one, and the registration with its low
-    map and with the scan's."""
+    """The scan, the truth if there is one, every surface without and with the network's map, and the registration with
+    its low map and with the scan's.
+
+    Args:
+        mapped: from vertices to the normals that the network gives them.
+    """
     frame_id = int(held.frame_ids[at])
     registered = methods[0].vertices
     span = np.ptp(registered.reshape(len(registered), -1, 3), axis=1).max(axis=0)
     framing = Framing((float(span[0]), float(span[1]), float(span[2])))
     view = framing.view(registered[at], "three_quarter")
-    scan = read_scan(capture, frame_id)
+    scan = readable_scan(capture, frame_id)
 
     def drawn(vertices: np.ndarray, normal_map: np.ndarray | None = None) -> str:
         mesh = template.mesh.with_vertices(vertices)
         return data_uri(render([Drawn(mesh, normal_map=normal_map)], view, width=WIDTH, height=HEIGHT))
 
     frames = template.frames(registered[at])
-    panels = [Panel("scan", data_uri(render([Drawn(scan.mesh, scan.colours)], view, width=WIDTH, height=HEIGHT)))]
+    panels = [no_scan()]
+    if scan is not None:
+        shown = render([Drawn(scan.mesh, scan.colours)], view, width=WIDTH, height=HEIGHT)
+        panels = [Panel("scan", data_uri(shown))]
     model = read_truth_model(capture)
     if model is not None:
         fine = model.fine.with_vertices(read_truth_vertices(capture, frame_id))
         panels.append(Panel("truth", data_uri(render([Drawn(fine)], view, width=WIDTH, height=HEIGHT))))
     for method in methods:
-        tangent = _tangent_image(template, method.normals[at], template.frames(method.vertices[at]))
-        panels.append(Panel(method.name, drawn(method.vertices[at], tangent if method.has_map else None)))
+        vertices = method.vertices[at]
+        own = template.frames(vertices)
+        if method.has_map:
+            panels.append(Panel(method.name, drawn(vertices, _tangent_image(template, method.normals[at], own))))
+            continue
+        panels.append(Panel(method.name, drawn(vertices)))
+        if method is not methods[0]:  # whose picture with the network's map is the network's
+            image = _tangent_image(template, mapped(vertices), own)
+            panels.append(Panel(f"{method.name}, {NETWORK}'s map", drawn(vertices, image)))
     panels.append(Panel("low map", drawn(registered[at], _tangent_image(template, methods[0].normals[at], frames))))
     valid = template.raster.read(held.valid[at, 0].numpy())
     world = template.raster.read(held.high[at].float().permute(1, 2, 0).numpy()) @ template.rotation(registered[at]).T

@@ -181,13 +181,14 @@ def trace(
     second_third = answer["primitive_uvs"].numpy()[hit]
     weights = np.column_stack([1 - second_third.sum(axis=1), second_third])
     normal = np.einsum("nk,nkc->nc", weights, np.concatenate(normals)[corners])
+    facing = -np.einsum("ij,ij->i", normal, rays[hit, 3:])
     first = 0
     for mesh, normal_map in zip(meshes, normal_maps or [None] * len(meshes), strict=True):
         if normal_map is not None:
             seen = (face >= first) & (face < first + len(mesh.faces))
             normal[seen] = _mapped(mesh, normal_map, face[seen] - first, weights[seen], normal[seen])
         first += len(mesh.faces)
-    light = _shade(normal, rays[hit, 3:], view).astype(np.float32)
+    light = _shade(normal, facing < 0, view).astype(np.float32)
     return Traced((height, width), counts, hit, corners, weights, light)
 
 
@@ -255,14 +256,17 @@ def _rays(view: View, rows: int, columns: int) -> Float32[np.ndarray, "rays 6"]:
     return np.concatenate([origins, directions], axis=2, dtype=np.float32).reshape(-1, 6)
 
 
-def _shade(normals: np.ndarray, directions: np.ndarray, view: View) -> np.ndarray:
-    """Light that reaches the eye, Lambert; sheets are lit on both sides, their backs dimmer."""
+def _shade(normals: np.ndarray, backs: np.ndarray, view: View) -> np.ndarray:
+    """Light that reaches the eye, Lambert; sheets are lit on both sides, their backs dimmer.
+
+    Args:
+        backs: what is seen from behind. The surface says so, not a normal map, which may lean past the outline.
+    """
     normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    facing = -np.einsum("ij,ij->i", normals, directions)
-    normals = np.where(facing[:, None] < 0, -normals, normals)
+    normals = np.where(backs[:, None], -normals, normals)
     lights = LIGHTS / np.linalg.norm(LIGHTS, axis=1, keepdims=True) @ view.axes()
     light = AMBIENT + np.clip(normals @ lights.T, 0, None) @ STRENGTHS
-    return np.where(facing < 0, 0.6, 1.0) * light
+    return np.where(backs, 0.6, 1.0) * light
 
 
 def _linear(srgb: np.ndarray) -> np.ndarray:

@@ -9,11 +9,15 @@ import numpy as np
 import pytest
 
 from capture4d.app.cli import main
+from capture4d.app.compare_garment import model_take
+from capture4d.errors import InputError
 from capture4d.garment_binding import bind
 from capture4d.records import save_body, save_poses
 from capture4d.scans import write_scan
 from capture4d.types import PoseSequence, Scan
-from tests.unit.wrinkles.conftest import make_work, some_garment, some_scan
+from capture4d.work_folder import load_moving_body, load_registration
+from retarget.stage import load_garment_model
+from tests.unit.wrinkles.conftest import make_work, outside_the_unit_square, some_garment, some_scan
 from tests.unit.wrinkles.test_offsets import limb, upright
 from tests.unit.wrinkles.test_stages import SMALL
 
@@ -24,7 +28,7 @@ FRAMES = 8
 def compared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A work folder with its comparison."""
     folder = tmp_path_factory.mktemp("compared")
-    garment, body = some_garment(), limb()
+    garment, body = outside_the_unit_square(some_garment()), limb()
     at, weights, skin_weights = bind(garment.template.vertices, garment.template.faces, upright(body))
     bound = replace(
         garment, embedding_faces=at, embedding_barycentric=weights, skin_weights=skin_weights.astype(np.float32)
@@ -80,8 +84,8 @@ def test_the_page_stands_alone_and_shows_all(compared: Path):
     assert page.count("regression, linear *") == 1
     assert "learned from these very frames" in page
     assert "http" not in page.replace("https://www.w3.org", "")
-    assert page.count("<figure>") == 2 * (9 + 6) + 5
-    for name in ("scan", "network", "offset images", "map of the scan"):
+    assert page.count("<figure>") == 2 * (9 + 4 + 6) + 5  # the other four surfaces have a picture with the map too
+    for name in ("scan", "network", "offset images", "blendshapes, network&#39;s map", "map of the scan"):
         assert f"<figcaption>{name}</figcaption>" in page
 
 
@@ -117,6 +121,66 @@ def test_a_network_that_has_seen_everything_is_refused(
     shutil.copytree(compared.parent, work, ignore=shutil.ignore_patterns("compare"))
     assert again(work / "compare", model) == 1
     assert "learned from it without held-out frames" in capsys.readouterr().err
+    assert not (work / "compare").exists()
+    shutil.rmtree(work / "wrinkles" / "pairs")  # other pairs of the same registration hide nothing
+    with pytest.raises(SystemExit):
+        main(["wrinkles", "maps", str(work), "--map.size", "64", "--projection.blur-texels", "0.3", "--workers", "1"])
+    assert again(work / "compare", model) == 1
+    assert "learned from it without held-out frames" in capsys.readouterr().err
+
+
+def test_maps_laid_out_otherwise_than_the_network_s_are_refused(
+    compared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    work = tmp_path / "work"
+    shutil.copytree(compared.parent, work, ignore=shutil.ignore_patterns("compare", "pairs"))
+    with pytest.raises(SystemExit):
+        main(["wrinkles", "maps", str(work), "--map.size", "64", "--map.padding", "6", "--workers", "1"])
+    assert again(work / "compare", compared.parents[1] / "model") == 1
+    assert "expected maps laid out as" in capsys.readouterr().err
+
+
+def test_a_scan_that_cannot_be_read_is_left_out(compared: Path, tmp_path: Path):
+    """It was flagged before; the comparison goes on."""
+    shutil.copytree(compared.parents[1] / "capture", tmp_path / "capture")
+    shutil.copytree(compared.parent, tmp_path / "work", ignore=shutil.ignore_patterns("compare"))
+    work = tmp_path / "work"
+    for stage in ("garment", "registration"):
+        record = json.loads((work / stage / "stage.json").read_text())
+        record["sources"] = {"capture": str(tmp_path / "capture")}
+        (work / stage / "stage.json").write_text(json.dumps(record))
+    scan = tmp_path / "capture" / "scans" / f"{FRAMES:06d}.ply"
+    scan.write_bytes(scan.read_bytes()[:1000])
+    lines = (work / "registration" / "metrics.jsonl").read_text().splitlines()
+    failed = json.dumps({"frame_id": FRAMES, "verdict": "failed"})
+    (work / "registration" / "metrics.jsonl").write_text("\n".join([*lines[:-1], failed]) + "\n")
+    assert again(work / "compare", compared.parents[1] / "model") == 0
+    assert json.loads((work / "compare" / "compare.json").read_text())["frames"] == [FRAMES - 1]
+
+
+def test_a_garment_model_learned_again_makes_the_page_stale(
+    compared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    work = tmp_path / "work"
+    shutil.copytree(compared.parent, work)
+    model = compared.parents[1] / "model"
+    linear = work / "retarget" / "linear.safetensors"
+    with pytest.raises(SystemExit):
+        main(["fit", str(work), "--regressor", "linear", "--shape.components", "3", "--linear.ridges", "7",
+              "--overwrite"])  # fmt: skip
+    assert linear.read_bytes() != (compared.parent / "retarget" / "linear.safetensors").read_bytes()
+    assert again(work / "compare", model) == 1
+    assert "regressors" in capsys.readouterr().err
+
+
+def test_a_model_of_another_template_is_refused(compared: Path):
+    work = compared.parent
+    known, sequence = load_garment_model(work), load_registration(work / "registration")
+    garment = known.model.garment
+    turned = replace(garment.template, faces=garment.template.faces[::-1].copy(), uv=None)
+    other = replace(known, model=replace(known.model, garment=replace(garment, template=turned)))
+    with pytest.raises(InputError, match="expected a model of the template that was registered"):
+        model_take(other, sequence, *load_moving_body(work), [0])
 
 
 @pytest.mark.parametrize(

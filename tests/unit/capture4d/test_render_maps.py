@@ -56,6 +56,16 @@ def test_a_dome_in_a_map_is_lit_like_a_dome_of_geometry():
     assert np.abs(flipped - real)[away_from_the_rim].mean() > 10
 
 
+def test_a_map_that_leans_past_the_outline_does_not_turn_a_surface_over():
+    """Seen from the front, light changes by little between normals just before and just past the outline."""
+    levels = []
+    for degrees in (88.0, 92.0):
+        leaning = np.zeros((SIZE, SIZE, 3), np.float32)
+        leaning[..., 1], leaning[..., 2] = np.sin(np.radians(degrees)), np.cos(np.radians(degrees))
+        levels.append(drawn(plate(UPRIGHT), leaning)[60:100, 60:100].mean())
+    assert abs(levels[0] - levels[1]) < 6
+
+
 @pytest.mark.parametrize(
     "uv",
     [[(0.0, 1.0), (0.0, 0.0), (1.0, 0.0), (1.0, 1.0)], [(1.0, 0.0), (0.0, 0.0), (0.0, 1.0), (1.0, 1.0)]],

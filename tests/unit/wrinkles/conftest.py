@@ -1,6 +1,7 @@
 """A small sleeve of cloth with seams, and scans of it that carry wrinkles."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +37,13 @@ def some_garment() -> Garment:
     mesh = sleeve(32, 24)
     low, high = sorted(boundary_loops(mesh.faces), key=lambda loop: mesh.vertices[loop, 1].mean())
     return Garment(mesh, {"hem": low, "neck": high})
+
+
+def outside_the_unit_square(garment: Garment) -> Garment:
+    """The same with a pattern that has to be packed for its maps."""
+    mesh = garment.template
+    assert mesh.uv is not None
+    return replace(garment, template=replace(mesh, uv=mesh.uv + 1))
 
 
 @pytest.fixture

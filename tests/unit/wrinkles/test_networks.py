@@ -23,7 +23,9 @@ def test_the_paper_s_networks_have_the_known_numbers_of_parameters():
         generator, discriminator = UNet(PAPER), PatchDiscriminator(PAPER)
     assert parameters(generator) == 54_413_955
     assert parameters(discriminator) == 2_768_705
-    assert PRESETS["paper"].network == PAPER
+    paper = PRESETS["paper"]
+    assert paper.network == PAPER
+    assert (paper.loss.gan, paper.loss.data, paper.loss.temporal, paper.loss.temporal_kind) == (1, 100, 50, "printed")
 
 
 @pytest.mark.parametrize(("size", "patches"), [(256, 30), (512, 62)])

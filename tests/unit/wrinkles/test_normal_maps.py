@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from capture4d.errors import InputError
 from capture4d.mesh import submesh
@@ -74,6 +75,30 @@ def test_gates_refuse_what_is_too_far_or_turned(garment: Garment, scan_of: Calla
     assert not project_scan(points, low, inside_out, SINGLE).valid.any()
     with pytest.raises(InputError, match="faces"):
         project_scan(points, low, Mesh(scan.vertices, np.zeros((0, 3), np.int32)), SINGLE)
+
+
+def test_the_nearest_point_answers_where_rays_miss_and_what_leans_too_far_does_not():
+    """A square that ends beside the point, in the plane below it, or tilted about it."""
+    row, column = np.mgrid[:9, :9]
+    square = np.stack([column.ravel() - 8.0, row.ravel() - 4.0, np.zeros(81)], axis=1) * 5e-3  # ends at x = 0
+    corner = (row * 9 + column)[:-1, :-1].ravel()
+    faces = np.concatenate(
+        [np.stack([corner, corner + 1, corner + 10], 1), np.stack([corner, corner + 10, corner + 9], 1)]
+    )
+    up, config = np.array([[0.0, 0, 1]]), replace(SINGLE, border_rings=0)
+
+    def seen(vertices: np.ndarray, x: float, **settings: float) -> bool:
+        scan = Mesh(vertices.astype(np.float32), faces.astype(np.int32))
+        return bool(project_scan(np.array([[x, 0, 0]]), up, scan, replace(config, **settings)).valid[0])
+
+    assert seen(square - [0, 0, 2e-3], -0.01)  # above the square
+    assert seen(square - [0, 0, 2e-3], 3e-3)  # beside it, 3.6 mm away
+    assert not seen(square - [0, 0, 2e-3], 6e-3)  # 6.3 mm
+    assert not seen(square - [0, 0, 7e-3], -0.01)
+    for degrees, wanted in ((40, True), (50, False)):
+        tilted = square @ Rotation.from_euler("y", degrees, degrees=True).as_matrix().T
+        assert seen(tilted, -1e-4) == wanted
+        assert seen(tilted, -1e-4, angle_deg=60.0)
 
 
 def test_a_hole_is_no_information_and_its_rim_is_not_trusted(garment: Garment, scan_of: Callable[..., Mesh]):

@@ -18,10 +18,11 @@ from scipy.spatial.transform import Rotation
 
 from capture4d.app.cli import main
 from capture4d.atomic_files import write_bytes, write_npy, write_npz
+from capture4d.mesh import submesh
 from capture4d.records import load_garment, save_garment
 from capture4d.types import Garment, Mesh
 from capture4d.workdir import open_stage
-from tests.unit.wrinkles.conftest import make_work, some_garment, some_scan, wrinkle_normals
+from tests.unit.wrinkles.conftest import make_work, outside_the_unit_square, some_garment, some_scan, wrinkle_normals
 from wrinkles import train_stage
 from wrinkles.config import MapConfig
 from wrinkles.display import fill_holes
@@ -102,10 +103,11 @@ def test_maps_are_written_as_they_were_computed(work: Path, garment: Garment):
     assert 8 < measured["difference_deg"] < 11
 
 
-def test_maps_lost_are_made_again_alike(work: Path):
+@pytest.mark.parametrize("which", ["low", "high"])
+def test_maps_lost_are_made_again_alike(work: Path, which: str):
     arguments = ("wrinkles", "maps", work, "--map.size", "64", "--workers", "1")
     assert run(*arguments) == 0
-    path = work / "wrinkles" / "pairs" / "high" / "000003.png"
+    path = work / "wrinkles" / "pairs" / which / "000003.png"
     before = path.read_bytes()
     path.unlink()
     assert run(*arguments) == 0
@@ -212,13 +214,20 @@ def test_maps_of_an_animation_do_not_hang_on_its_template(work: Path, trained: P
     np.testing.assert_allclose(found, wanted, atol=1e-3)
 
 
-def test_a_model_keeps_the_layout_of_its_maps(work: Path, tmp_path: Path):
+def test_a_model_keeps_the_layout_of_its_maps(tmp_path: Path):
     """Islands that were packed with another padding lie elsewhere."""
-    model = tmp_path / "padded"
+    garment = outside_the_unit_square(some_garment())
+    layouts = [MapTemplate.create(garment, MapConfig(size=64, padding=padding)).mesh.uv for padding in (4, 6)]
+    assert not np.array_equal(*layouts)
+    work, model = (
+        make_work(tmp_path, garment, [some_scan(phase=0.3 * frame) for frame in range(6)]),
+        tmp_path / "padded",
+    )
     assert run(*train(work, model, "--pairs.map.padding", "6", "--schedule.steps", "2")) == 0
     assert run("wrinkles", "apply", model, work, "--workers", "1") == 0
     made = load_garment(work / "wrinkles" / "generated" / "template.npz").template
     np.testing.assert_array_equal(made.uv, load_garment(work / "wrinkles" / "pairs" / "template.npz").template.uv)
+    np.testing.assert_array_equal(made.uv, layouts[1])
 
 
 @pytest.mark.parametrize("log_every", [2, 3])
@@ -295,6 +304,12 @@ def test_the_newest_checkpoint_is_the_one_with_the_most_steps(work: Path, traine
         (("--schedule.log-every", "0"), "schedule.log_every: expected at least 1, found 0"),
         (("--network.layers", "9"), "network.layers: expected at most 5"),
         (("--held-out", "1"), "held_out: expected a share from 0 to below 1, found 1"),
+        (("--held-out-gap", "-5"), "held_out_gap: expected at least 0, found -5"),
+        (("--schedule.learning-rate", "-1"), "schedule.learning_rate: expected a positive rate, found -1"),
+        (("--schedule.beta1", "1.5"), "schedule.beta1: expected a number from 0 to below 1, found 1.5"),
+        (("--workers", "0"), "--workers: expected at least 1, found 0"),
+        (("--pairs.map.size", "0"), "map.size: expected a number, at least 1, found 0"),
+        (("--pairs.projection.distance-m", "nan"), "projection.distance_m: expected a number, at least 0, found nan"),
     ],
 )
 def test_settings_out_of_range_leave_nothing_behind(
@@ -380,10 +395,17 @@ def test_the_group_has_an_overview(capsys: pytest.CaptureFixture[str]):
     assert "did you mean 'wrinkles train'" in capsys.readouterr().err
 
 
-def test_filling_is_for_display_only(work: Path):
+def test_filling_is_for_display_only(tmp_path: Path, garment: Garment):
     """A hole in a scan stays a hole in the pairs; only what is shown has none."""
+    scan, centre = some_scan(), np.array([0.1, 0.25, 0])
+    away = np.linalg.norm(scan.vertices[scan.faces].mean(axis=1) - centre, axis=1)
+    work = make_work(tmp_path, garment, [submesh(scan, away > 0.04)[0]])
     assert run("wrinkles", "maps", work, "--map.size", "64", "--workers", "1") == 0
     high, valid = decode_png((work / "wrinkles" / "pairs" / "high" / "000001.png").read_bytes(), source="high")
-    assert not valid.all()
+    raster = MapTemplate.create(garment, MapConfig(size=64)).raster
+    hole = np.linalg.norm(raster.at_vertices(garment.template.vertices.astype(float)) - centre, axis=1) < 0.03
+    assert (hole & raster.inside).sum() > 5
+    assert not raster.read(valid)[hole].any()
+    assert raster.read(valid)[raster.inside].mean() > 0.8
     assert np.abs(high[~valid]).max() < 1e-4
     assert np.linalg.norm(fill_holes(high, valid)[~valid], axis=-1).min() > 0

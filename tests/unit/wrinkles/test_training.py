@@ -1,5 +1,6 @@
 """A network learns one pair by heart; a run that was interrupted goes on as if it had not been."""
 
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +9,8 @@ import torch
 from torch.nn.functional import normalize
 
 from capture4d.errors import InputError
-from wrinkles.config import AugmentationConfig, LossConfig, NetworkConfig, ScheduleConfig, WrinkleConfig
+from wrinkles.config import AugmentationConfig, LossConfig, NetworkConfig, ScheduleConfig, TemporalLoss, WrinkleConfig
+from wrinkles.losses import data_loss, gan_loss, temporal_loss
 from wrinkles.pairs import PairTake, augmented, batches, fitted, halved, split
 from wrinkles.training import learning_rate, load_tensors, new_state, state_tensors, train_step
 
@@ -45,6 +47,37 @@ def test_an_overfitted_pair_is_learned_by_heart():
     for batch, _ in zip(batches([one], size=1, seed=0, start=0), range(100), strict=False):
         losses.append(train_step(state, batch, config)["data"])
     assert losses[-1] < 0.15 * losses[0]
+
+
+@pytest.mark.parametrize("kind", ["printed", "l1", "l2"])
+def test_a_step_follows_the_gradient_of_the_loss_as_written(kind: TemporalLoss):
+    """1 * GAN + 100 * L1 to the frame's own map + 50 * temporal to that of the frame before, over known texels."""
+    config = replace(
+        CONFIG, augmentation=AugmentationConfig(), network=replace(CONFIG.network, dropout=0.0),
+        loss=LossConfig(temporal_kind=kind),
+    )  # fmt: skip
+    state, known = new_state(config), take()
+    known.valid[2:, :, 20:24] = False
+    batch = next(batches([known], size=2, seed=0, start=0))
+    unknown = ~batch.valid.expand_as(batch.high)
+    shown: list[torch.Tensor] = []
+    state.discriminator.register_forward_pre_hook(lambda _, arguments: shown.append(arguments[1].detach()))
+    twin = copy.deepcopy(state.generator).train()
+    losses = train_step(state, batch, config)
+    assert len(shown) == 3  # the true map and the made one, and again the made one
+    assert all((each[unknown] == 0).all() for each in shown)
+
+    made = twin(batch.low)
+    both = batch.valid & batch.previous_valid
+    data, temporal = data_loss(made, batch.high, batch.valid), temporal_loss(made, batch.previous, both, kind)
+    assert losses["data"] == pytest.approx(data.item(), rel=1e-4)
+    assert losses["temporal"] == pytest.approx(temporal.item(), rel=1e-4)
+    assert temporal_loss(made, batch.high, both, kind).item() != pytest.approx(temporal.item(), rel=0.01)
+    logits = state.discriminator(batch.low, made * batch.valid)  # it has made its step, and stands
+    (gan_loss(logits, real=True) + 100 * data + 50 * temporal).backward()
+    for mine, own in zip(state.generator.parameters(), twin.parameters(), strict=True):
+        assert mine.grad is not None and own.grad is not None  # noqa: PT018
+        torch.testing.assert_close(mine.grad, own.grad, rtol=1e-3, atol=1e-5 * float(own.grad.abs().max()) + 1e-7)
 
 
 def test_a_resumed_run_is_the_same_run_bit_for_bit():
