@@ -71,7 +71,7 @@ def run(
                 lstm=replace(config.lstm, layers=2 if quick else 4, over_linear=False, weighed=False),
                 training=replace(config.training, weight_decay=0.0, control_noise=0.0),
             )
-            wanted = ("lstm_to_linear_mse", "linear_vertex_mm", "lstm_vertex_mm")
+            wanted = ("lstm_to_linear_mse", "lstm_to_linear_printed_mse", "linear_vertex_mm", "lstm_vertex_mm")
             metrics += [
                 replace(metric, key=f"paper_{metric.key}")
                 for metric in _methods(taken, paper, 1)

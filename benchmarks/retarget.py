@@ -7,6 +7,7 @@ default    the same, and out of the body
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +37,7 @@ def run(*, quick: bool = False, workers: int = 2, tracked: bool = True, every: i
         quick: a tiny set, registered with the capture's poses; the same keys.
         workers: processes that make the takes and register them.
         tracked: register with tracked poses.
-        every: measure every n-th frame of a clip.
+        every: measure every n-th frame of a clip, unless it was flagged.
     """
     config, folder = training_set(quick=quick, workers=workers)
     taken = lesson(config, folder, truth=False, tracked=tracked and not quick, workers=workers)
@@ -77,12 +78,13 @@ def _on(
     names = list(config.takes)
     for clip in config.held_out:
         truth, person, poses, _ = true_take(read_capture(folder / "bodies" / who / clip, scans=False))
-        rows = range(0, len(poses.frame_ids), every)
-        start = taken.takes.start(names.index(clip))
+        take = names.index(clip)
+        rows = [row for row in range(0, len(poses.frame_ids), every) if taken.takes.takes[take].good[row]]
+        start = taken.takes.start(take)
         frames = [start + row for row in rows]
         captured = project(space, taken.takes.vertices[frames], taken.takes.weights[frames]).astype(np.float32)
         coefficients = np.zeros((len(poses.frame_ids), captured.shape[1]), np.float32)
-        coefficients[list(rows)] = captured
+        coefficients[rows] = captured
         for method in METHODS:
             animated = _animated(method, taken, model, person, poses, coefficients, rows)
             errors[method] += [_error_mm(each.vertices, truth, row) for each, row in zip(animated, rows, strict=True)]
@@ -98,7 +100,7 @@ def _animated(
     person: ShapedBody,
     poses: PoseSequence,
     coefficients: np.ndarray,
-    rows: range,
+    rows: Sequence[int],
 ) -> list[AnimatedFrame]:
     settings = AnimateConfig(
         mean="captured" if method == "naive" else "corrected", removal=RemovalConfig(enabled=method == "default")

@@ -161,13 +161,13 @@ def load_moving_body(work: Path) -> tuple[Body, PoseSequence]:
 
 def find_moving_body(work: Path) -> tuple[Body, PoseSequence] | None:
     """The same, or None: those that were tracked, or those of the capture."""
+    if is_animated(work):
+        return load_tracking(work / "body")
     upstream = read_json(work / "registration" / "stage.json").get("upstream", {})
     if "body" in upstream:
         if require_complete(work / "body", "track", f"capture4d track CAPTURE --output {work}") != upstream["body"]:
             raise StaleError(f"{work}: expected the body with which it was registered, found another; run: capture4d "
                              f"register CAPTURE --output {work} --tracked --overwrite")  # fmt: skip
-        return load_tracking(work / "body")
-    if is_animated(work):
         return load_tracking(work / "body")
     body, poses = captured_motion(read_capture(capture_path(work)))
     return None if body is None or poses is None else (body, poses)

@@ -70,7 +70,8 @@ def run(
         poses: a motion file; resampled to the model's frame rate.
         output: work folder; gets body/ and registration/.
         body: another person's body.npz, made of the same faces and joints.
-        beta: shape coefficients of the person; the captured person without `body` and `beta`.
+        beta: shape coefficients of the person; without them those of the poses.npz beside `body`; without that as well
+            the mean of `body`, or, without `body`, the captured person.
         coefficients: of the motion's frames, instead of a regressor's: a take's own projections, or edited ones.
     Raises:
         InputError: a file is damaged, the poses or the body are of another skeleton, or numbers are not finite.
@@ -88,8 +89,10 @@ def run(
     }
     if coefficients is not None:
         expected = (len(motion.frame_ids), len(known.model.std))
-        if coefficients.shape != expected or not np.isfinite(coefficients).all():
-            raise InputError(f"coefficients: expected finite ones of {expected}, found {coefficients.shape}")
+        if coefficients.shape != expected:
+            raise InputError(f"coefficients: expected an array of {expected}, found {coefficients.shape}")
+        if not np.isfinite(coefficients).all():
+            raise InputError("coefficients: expected finite numbers, found NaN or inf")
         upstream["regressor"] = hashlib.sha256(coefficients.tobytes()).hexdigest()
     if body is not None:
         upstream["body"] = file_digest([body], root=body.parent)
@@ -125,12 +128,16 @@ def run(
 
 
 def _model(path: Path, config: AnimateConfig, device: str) -> tuple[GarmentModel, str]:
-    """The model, and which of its regressors is meant; torch is loaded only for the LSTM."""
+    """The model, and which of its regressors is meant; torch is loaded only if the LSTM takes part."""
     known = load_garment_model(path, device=device, with_lstm=config.regressor in ("auto", "ensemble", "lstm"))
     found = list(known.regressors)
     name = found[-1] if config.regressor == "auto" else config.regressor
     if name not in found:
-        raise InputError(f"{known.folder}: expected a regressor '{name}' in the model, found {', '.join(found)} only")
+        apart = name == "ensemble" and {"kernel", "lstm"} <= {*found}
+        why = "; its kernels do not see all that its LSTM sees" if apart else ""
+        raise InputError(
+            f"{known.folder}: expected a regressor '{name}' in the model, found {', '.join(found)} only{why}"
+        )
     return known, name
 
 
@@ -142,7 +149,7 @@ def _person(known: GarmentModel, body: Path | None, beta: Sequence[float] | None
     try:
         require_skeleton(known.model, other)
         shape = np.zeros(len(other.shape_directions), np.float32)
-        given = np.asarray(() if beta is None else beta, np.float32)
+        given = np.asarray(_own_shape(body) if beta is None else beta, np.float32)
         if not np.isfinite(given).all():
             raise InputError("beta: expected finite numbers, found NaN or inf")
         if len(given) > len(shape):
@@ -151,6 +158,13 @@ def _person(known: GarmentModel, body: Path | None, beta: Sequence[float] | None
         return with_shape(other, shape)
     except InputError as error:
         raise InputError(f"{body}: {error}" if body is not None else str(error)) from None
+
+
+def _own_shape(body: Path | None) -> np.ndarray:
+    """The shape of the person in a capture's or a tracked take's body.npz: that of the poses beside it. Of a body.npz
+    that stands alone, the mean."""
+    poses = None if body is None else body.with_name("poses.npz")
+    return np.zeros(0, np.float32) if poses is None or not poses.is_file() else load_poses(poses).shape
 
 
 def _motion(known: GarmentModel, path: Path, person: ShapedBody) -> PoseSequence:

@@ -46,7 +46,7 @@ def garment_joints(
 
 @dataclass(frozen=True, slots=True)
 class ControlLayout:
-    """What stands in a control vector, in which units and at which rate; part of every learned regressor."""
+    """What stands in a control vector, and at which rate; part of every learned regressor, whose file has the units."""
 
     joint_names: tuple[str, ...]
     """Of the whole skeleton."""

@@ -141,9 +141,7 @@ def fitting_clips(
     clips as well; but not the end of a take whose beginning was learned from, for it is all there is to show what came
     of it.
     """
-    begun = {piece.take for piece in pieces if piece.role == "training"}
-    learned = [piece for piece in pieces if piece.role == "training"]
-    late = [piece for piece in pieces if piece.role == "validation" and piece.take not in begun]
+    learned, late = _learned_pieces(pieces)
 
     def clips(pieces: Sequence[Piece], role: Role) -> list[Clip]:
         found = regression_clips(takes, pieces, role, layout, space, None, projected)
@@ -184,23 +182,33 @@ def vertex_error_m(
 def training_poses(
     takes: UnposedTakes, pieces: Sequence[Piece], layout: ControlLayout, mirror: Mirror | None = None
 ) -> PoseRange:
-    """The poses of the good frames that were learned from, and how far away from them those of validation were."""
+    """The poses of the good frames that regressors learn from in the end (`fitting_clips`), and how far those of
+    validation were from the ones of training while they validated."""
 
-    def quaternions(role: Role, mirror: Mirror | None) -> np.ndarray:
+    def quaternions(chosen: Sequence[Piece], mirror: Mirror | None) -> np.ndarray:
         found = [np.zeros((0, len(layout.joints), 4), np.float32)]
-        for piece in pieces:
-            if piece.role == role:
-                take = takes.takes[piece.take]
-                rotations = (take.poses if mirror is None else mirror.poses(take.poses)).rotations
-                good = np.flatnonzero(take.good[piece.frames.start : piece.frames.stop]) + piece.frames.start
-                found.append(pose_quaternions(rotations[good], layout.joints))
+        for piece in chosen:
+            take = takes.takes[piece.take]
+            rotations = (take.poses if mirror is None else mirror.poses(take.poses)).rotations
+            good = np.flatnonzero(take.good[piece.frames.start : piece.frames.stop]) + piece.frames.start
+            found.append(pose_quaternions(rotations[good], layout.joints))
         return np.concatenate(found)
 
-    known, validated = quaternions("training", None), quaternions("validation", None)
-    if mirror is not None:
-        known = np.concatenate([known, quaternions("training", mirror)])
-    distances, _ = nearest_poses(validated, known)
-    return PoseRange(known, layout.joints, float(np.percentile(distances, 95)) if len(distances) else 0.0)
+    def seen(chosen: Sequence[Piece]) -> np.ndarray:
+        return np.concatenate([quaternions(chosen, each) for each in ((None,) if mirror is None else (None, mirror))])
+
+    training, late = _learned_pieces(pieces)
+    first, validation = seen(training), [piece for piece in pieces if piece.role == "validation"]
+    distances, _ = nearest_poses(quaternions(validation, None), first)
+    validated = float(np.percentile(distances, 95)) if len(distances) else 0.0
+    return PoseRange(np.concatenate([first, seen(late)]), layout.joints, validated)
+
+
+def _learned_pieces(pieces: Sequence[Piece]) -> tuple[list[Piece], list[Piece]]:
+    """What is learned from, and what is learned from as well once it has validated."""
+    begun = {piece.take for piece in pieces if piece.role == "training"}
+    training = [piece for piece in pieces if piece.role == "training"]
+    return training, [piece for piece in pieces if piece.role == "validation" and piece.take not in begun]
 
 
 def predictions(regressor: Regressor, clips: Sequence[Clip]) -> list[Float32[np.ndarray, "frames shapes"]]:

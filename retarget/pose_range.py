@@ -33,10 +33,10 @@ class PoseRange:
     joints: tuple[int, ...]
     """The garment's, as positions in the skeleton."""
     validated_deg: float
-    """How far validation frames were from the training poses, 95 %."""
+    """How far validation frames were from the training poses while they validated, 95 %."""
 
     def distances(self, poses: PoseSequence) -> Float64[np.ndarray, " frames"]:
-        """Degrees to the nearest training pose."""
+        """Degrees to the nearest learned pose."""
         return nearest_poses(pose_quaternions(poses.rotations, self.joints), self.quaternions)[0]
 
 

@@ -38,6 +38,16 @@ __all__ = [
 ]
 
 
+UNITS = {
+    "rotations": "R - I, first two columns",
+    "velocity": "m/s",
+    "acceleration": "m/s^2",
+    "turning": "rad/s",
+    "history": "whitened coefficients",
+    "coefficients": "m",
+}
+"""Written with every regressor, for people."""
+
 LEAST_LIVELY = 0.2
 """Share of the largest standard deviation of a kind of controls by which each of them is divided at least."""
 
@@ -254,7 +264,7 @@ def write_regressor(
         "coefficient_std": scales.std,
         **tensors,
     }
-    write_tensors(path, kind, everything, {"layout": asdict(layout), "model": model_digest, **note})
+    write_tensors(path, kind, everything, {"layout": asdict(layout), "units": UNITS, "model": model_digest, **note})
 
 
 def read_regressor(path: Path, kind: str, *, model_digest: str) -> tuple[TensorFile, ControlLayout, Scales]:

@@ -57,12 +57,14 @@ from retarget.pose_range import PoseRange, load_pose_range, save_pose_range
 from retarget.regressors import FittingClips, Regressor, mean_squared_error
 from retarget.splits import ROLES, Piece, split_takes
 
-__all__ = ["GarmentModel", "learned_frames", "load_garment_model", "run"]
+__all__ = ["GarmentModel", "learned_frames", "load_garment_model", "regressor_files", "run"]
 
 SCHEMA = 3
 MODEL, LINEAR, KERNEL, LSTM, POSES = (
     f"{name}.safetensors" for name in ("blendshapes", "linear", "kernel", "lstm", "poses")
 )
+SAME_WEIGHTS = 1e-3
+"""Largest difference of skin weights that are the same."""
 
 
 def run(
@@ -172,7 +174,8 @@ def _moving_bodies(works: Sequence[Path]) -> tuple[Body, list[PoseSequence]]:
     """The one body of all takes, and the poses of each."""
     found = [load_moving_body(work) for work in works]
     body, first = found[0]
-    template = load_garment(works[0] / "registration" / "garment.npz").template
+    bound = load_garment(works[0] / "registration" / "garment.npz")
+    template, skin_weights = bound.template, bound.skin_weights
     for work, (other, poses) in zip(works, found, strict=True):
         if other.joint_names != body.joint_names or not np.array_equal(other.template.faces, body.template.faces):
             raise InputError(f"{work}: expected the body of {works[0]}, found another skeleton or mesh")
@@ -187,6 +190,10 @@ def _moving_bodies(works: Sequence[Path]) -> tuple[Body, list[PoseSequence]]:
                 f"{len(template.faces)} faces), found one of {len(garment.template.vertices)} and "
                 f"{len(garment.template.faces)}"
             )
+        ours, theirs = skin_weights, garment.skin_weights
+        if ours is not None and theirs is not None and not np.allclose(ours, theirs, atol=SAME_WEIGHTS):
+            raise InputError(f"{work}: expected the skin weights of {works[0]}, found others; one template serves all "
+                             "takes, bound once")  # fmt: skip
     return body, [poses for _, poses in found]
 
 

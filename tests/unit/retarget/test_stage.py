@@ -16,7 +16,8 @@ from capture4d.errors import InputError
 from capture4d.records import load_body, save_body, save_garment, save_poses
 from capture4d.tensor_files import read_tensors, write_tensors
 from capture4d.work_folder import load_moving_body, load_records, load_registration
-from retarget.config import SplitConfig
+from retarget.animate_stage import run as animate_poses
+from retarget.config import AnimateConfig, SplitConfig
 from retarget.splits import split_takes
 
 QUICK = (
@@ -170,6 +171,69 @@ def test_an_interrupted_animation_is_finished_by_the_same_command(model: Path, w
     assert read_json(output / "registration" / "stage.json")["digest"] == digest
 
 
+def test_animate_takes_the_ensemble_unless_told_otherwise(model: Path, works, tmp_path: Path, capsys) -> None:
+    poses = works[0] / "body" / "poses.npz"
+    said = {}
+    for name in ("auto", "ensemble", "kernel", "lstm", "linear"):
+        assert run(*animate(model, poses, tmp_path / name, "--regressor", name)) == 0
+        said[name] = np.load(tmp_path / name / "registration" / "coefficients.npy")
+    np.testing.assert_array_equal(said["auto"], said["ensemble"])
+    np.testing.assert_allclose(said["ensemble"], 0.75 * said["kernel"] + 0.25 * said["lstm"], atol=1e-6)
+    assert np.abs(said["lstm"] - said["kernel"]).max() > 1e-3
+    assert np.abs(said["lstm"] - said["linear"]).max() > 1e-3
+    (model / "lstm.safetensors").unlink()
+    assert run(*animate(model, poses, tmp_path / "no lstm")) == 0
+    np.testing.assert_array_equal(np.load(tmp_path / "no lstm" / "registration" / "coefficients.npy"), said["kernel"])
+    assert "expected a regressor 'ensemble'" in fails(
+        capsys, *animate(model, poses, tmp_path / "x", "--regressor", "ensemble")
+    )
+
+
+def test_kernels_that_see_less_than_the_network_stand_alone(works, tmp_path: Path, capsys) -> None:
+    output = tmp_path / "up"
+    assert run("fit", *works, "--output", output, *QUICK, "--control.up") == 0
+    assert "ensemble" not in read_json(output / "retarget" / "fit.json")
+    poses = works[0] / "body" / "poses.npz"
+    assert "its kernels do not see all that its LSTM sees" in fails(
+        capsys, *animate(output, poses, tmp_path / "x", "--regressor", "ensemble")
+    )
+
+
+def test_a_body_is_the_person_whose_poses_lie_beside_it(model: Path, works, tmp_path: Path) -> None:
+    body, poses = load_moving_body(works[0])
+    other = np.float32([1.5] + [0.0] * (len(poses.shape) - 1))
+    save_body(tmp_path / "anna" / "body.npz", body)
+    save_poses(tmp_path / "anna" / "poses.npz", replace(poses, shape=other))
+    save_body(tmp_path / "alone" / "body.npz", body)
+    motion = works[0] / "body" / "poses.npz"
+    for who, more, wanted in (("anna", (), other), ("alone", (), 0 * other), ("anna", ("--beta", "-1"), [-1])):
+        output = tmp_path / f"{who}{len(more)}"
+        given = ("--body", tmp_path / who / "body.npz", *more, "--regressor", "linear")
+        assert run(*animate(model, motion, output, *given)) == 0
+        np.testing.assert_array_equal(load_moving_body(output)[1].shape[: len(wanted)], wanted)
+
+
+def test_coefficients_that_are_no_numbers_are_refused(model: Path, works, tmp_path: Path) -> None:
+    poses = works[0] / "body" / "poses.npz"
+    count = len(load_blendshapes(model / "blendshapes.safetensors").std)
+    for coefficients, said in (
+        (np.full((16, count), np.nan, np.float32), "expected finite numbers, found NaN"),
+        (np.zeros((15, count), np.float32), r"expected an array of \(16, 3\), found \(15, 3\)"),
+    ):
+        with pytest.raises(InputError, match=said):
+            animate_poses(model, poses, tmp_path / "x", AnimateConfig(), coefficients=coefficients)
+    assert not (tmp_path / "x").exists()
+
+
+def test_poses_that_validated_and_were_learned_from_then_are_no_strangers(model: Path, works, tmp_path: Path) -> None:
+    """They all lie at no distance; how far they lay when they validated is known beside."""
+    poses = works[2] / "body" / "poses.npz"
+    assert run(*animate(model, poses, tmp_path / "again", "--unlike-deg", "0")) == 0
+    distances = [record["pose_distance_deg"] for record in load_records(tmp_path / "again" / "registration")]
+    assert max(np.delete(distances, 4)) < 0.1  # one frame was flagged
+    assert read_json(model / "fit.json")["validated_deg"] > 1
+
+
 def test_unlike_poses_are_flagged(model: Path, works, motion, tmp_path: Path) -> None:
     poses = motion(6, 9)
     twisted = poses.rotations.copy()
@@ -203,6 +267,11 @@ def test_takes_that_do_not_fit_together_are_one_line(works, write_work, motion, 
     assert "take8: expected the template of" in line
     slow = write_work(tmp_path / "take7", replace(motion(10, 7), fps=30.0))
     assert "expected 60 frames a second" in fails(capsys, "fit", *works, slow, "--output", tmp_path / "y", *QUICK)
+    weights = world.garment.skin_weights[:, ::-1].copy()
+    anew = write_work(tmp_path / "take6", motion(10, 7))
+    save_garment(anew / "registration" / "garment.npz", replace(world.garment, skin_weights=weights))
+    line = fails(capsys, "fit", *works, anew, "--output", tmp_path / "v", *QUICK)
+    assert "take6: expected the skin weights of" in line
     assert "--output: expected" in fails(capsys, "fit", *works)
     assert "found take0, take0" in fails(capsys, "fit", works[0], works[0], "--output", tmp_path / "z")
     assert "run: capture4d run" in fails(capsys, "fit", tmp_path / "nothing")
