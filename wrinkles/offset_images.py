@@ -3,8 +3,8 @@
 A cloth pixel is a vertex of the template on one UV island, so a vertex on a seam is two pixels. It is bound to a point
 p of the body, and carries the offset of the cloth from there, along tangent, bitangent and normal. The tangent is the
 direction of the cloth's u, taken on the cloth as it lies shrunk onto the body and turned into the body's tangent
-plane; Jin et al. do not say whether they mean that or the body's own UVs. Islands that face forwards lie in one image,
-the others in a second: six channels.
+plane (`local`); Jin et al. do not say whether they mean that or the body's own UVs (`body_local`). Islands that face
+forwards lie in one image, the others in a second: six channels.
 
 Letters: P cloth pixels, V vertices of the template, B frames of a batch.
 
@@ -32,7 +32,7 @@ from capture4d.uv_raster import UvRaster, rasterise_uv, sample_bilinear
 
 __all__ = ["Anchors", "OffsetLayout", "OffsetSampler", "OffsetSpace", "decode", "encode"]
 
-OffsetSpace = Literal["local", "root_offset", "root_position"]
+OffsetSpace = Literal["local", "body_local", "root_offset", "root_position"]
 AMBIGUOUS = 0.35
 """Islands whose mean normal points less forwards or backwards than this, such as sleeves, go where there is room."""
 
@@ -108,7 +108,11 @@ class OffsetLayout:
         return np.stack([raster.image(np.ones(len(raster.texels), bool)) for raster in self.rasters], axis=-1)
 
     def anchors(self, body: PosedBody, space: OffsetSpace = "local") -> Anchors:
-        """Where offsets start in a pose."""
+        """Where offsets start in a pose.
+
+        Raises:
+            InputError: `body_local` is wanted of a body without UVs.
+        """
         garment, faces = self.garment, body.shaped.body.template.faces
         assert garment.embedding_faces is not None
         assert garment.embedding_barycentric is not None
@@ -117,9 +121,18 @@ class OffsetLayout:
         points = np.einsum("vk,vkc->vc", weights, skinned[corners])[self.vertex]
         root = body.transforms[0]
         match space:
-            case "local":
-                normals = np.einsum("vk,vkc->vc", weights, vertex_normals(skinned, faces)[corners])[self.vertex]
+            case "local" | "body_local":
+                at_vertices = vertex_normals(skinned, faces)
+                normals = np.einsum("vk,vkc->vc", weights, at_vertices[corners])[self.vertex]
                 normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+                if space == "body_local":
+                    bound = garment.embedding_faces[self.vertex]
+                    layout = TangentLayout(faces, require_uvs(body.shaped.body.template))
+                    at_corners = layout.tangents(skinned, at_vertices)[bound]
+                    tangents = np.einsum("pk,pkc->pc", weights[self.vertex], at_corners)
+                    return Anchors(
+                        points, interpolated_frames(normals, tangents, layout.sign[bound]).transpose(0, 2, 1)
+                    )
                 # cloth shrunk to a point has no direction of its own; the edge of its body face turns with the body
                 edge = (skinned[corners[:, 1]] - skinned[corners[:, 0]])[self.vertex]
                 across = edge - np.einsum("pc,pc->p", edge, normals)[:, None] * normals

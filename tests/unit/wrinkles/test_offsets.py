@@ -10,7 +10,7 @@ from capture4d.body import PosedBody, with_pose, with_shape
 from capture4d.errors import InputError
 from capture4d.types import Body, Garment, Mesh, PoseSequence
 from tests.unit.wrinkles.conftest import sleeve, wrinkled
-from wrinkles.offset_images import OffsetLayout, OffsetSampler, decode, encode
+from wrinkles.offset_images import Anchors, OffsetLayout, OffsetSampler, decode, encode
 from wrinkles.offset_networks import FullyConnected, ImageDecoder, PcaFullyConnected
 from wrinkles.offset_training import (
     OffsetConfig,
@@ -30,7 +30,7 @@ def limb() -> Body:
     vertices = mesh.vertices * np.array([0.5, 1, 0.5], np.float32)
     bend = np.clip((vertices[:, 1] - 0.15) / 0.2, 0, 1)
     return Body(
-        Mesh(vertices, mesh.faces),
+        Mesh(vertices, mesh.faces, mesh.uv),
         np.zeros((1, len(vertices), 3), np.float32),
         np.array([[0, 0, 0], [0, 0.25, 0]], np.float32),
         np.zeros((1, 2, 3), np.float32),
@@ -67,7 +67,7 @@ def bound(garment: Garment) -> tuple[Garment, Body]:
     return embedded, body
 
 
-@pytest.mark.parametrize("space", ["local", "root_offset", "root_position"])
+@pytest.mark.parametrize("space", ["local", "body_local", "root_offset", "root_position"])
 def test_encoding_and_decoding_is_exact(bound: tuple[Garment, Body], space: str):
     garment, body = bound
     layout = OffsetLayout.create(garment, 64)
@@ -79,17 +79,50 @@ def test_encoding_and_decoding_is_exact(bound: tuple[Garment, Body], space: str)
     )
 
 
-def test_local_offsets_do_not_see_the_body_turn(bound: tuple[Garment, Body]):
+@pytest.mark.parametrize("space", ["local", "body_local"])
+def test_local_offsets_do_not_see_the_body_turn(bound: tuple[Garment, Body], space: str):
     garment, body = bound
     layout = OffsetLayout.create(garment, 64)
-    before = layout.anchors(upright(body))
+    before = layout.anchors(upright(body), space)  # pyright: ignore
     turn = turned(1.0)
-    rolled = layout.anchors(with_pose(with_shape(body, np.zeros(1)), np.stack([turn, np.eye(3)]), np.ones(3)))
+    posed = with_pose(with_shape(body, np.zeros(1)), np.stack([turn, np.eye(3)]), np.ones(3))
+    rolled = layout.anchors(posed, space)  # pyright: ignore
     cloth = garment.template.vertices[layout.vertex].astype(float)
     np.testing.assert_allclose(encode(rolled, cloth @ turn.T + 1), encode(before, cloth), atol=1e-6)
     # on a coaxial tube the cloth lies 5 cm out along the normal
     offset = encode(before, cloth)
     assert np.abs(np.median(offset, axis=0) - [0, 0, 0.05]).max() < 2e-3
+
+
+def test_tangents_of_the_body_run_along_its_own_uvs(bound: tuple[Garment, Body]):
+    """Around the tube; the cloth's own UVs, turned by a quarter, run along it, and a body needs some."""
+    garment, body = bound
+    uv = garment.template.uv
+    assert uv is not None
+    quarter = np.stack([uv[..., 1], 2 - uv[..., 0]], axis=-1).astype(np.float32)
+    layout = OffsetLayout.create(replace(garment, template=replace(garment.template, uv=quarter)), 64)
+    middle = np.abs(garment.template.vertices[layout.vertex, 1] - 0.25) < 0.15
+    for space, axis in (("body_local", [1, 0, 1]), ("local", [0, 1, 0])):
+        tangents = layout.anchors(upright(body), space).axes[middle, :, 0]  # pyright: ignore
+        assert np.linalg.norm(tangents * axis, axis=1).min() > 0.97
+    bare = replace(body, template=replace(body.template, uv=None))
+    with pytest.raises(InputError, match="UV"):
+        layout.anchors(upright(bare), "body_local")
+
+
+@pytest.mark.parametrize(("depth", "cusps"), [(0.2, 0), (0.5, 4), (4.5, 0)])
+def test_constant_offsets_of_an_ellipse_make_a_swallowtail(depth: float, cusps: int):
+    """Simple offsets, complex shapes (Jin et al., Fig. 6): inwards by more than the smallest radius of curvature, here
+    0.25, and less than the largest, 2, the curve turns back four times."""
+    angle = np.linspace(0, 2 * np.pi, 4001)
+    points = np.stack([np.cos(angle), 0.5 * np.sin(angle), 0 * angle], axis=1)
+    along = np.stack([-np.sin(angle), 0.5 * np.cos(angle), 0 * angle], axis=1)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    up = np.broadcast_to([0.0, 0, 1], points.shape)
+    anchors = Anchors(points, np.stack([along, up, np.cross(along, up)], axis=2))
+    curve = decode(anchors, np.broadcast_to([0, 0, -depth], points.shape))
+    forwards = np.einsum("pc,pc->p", np.diff(curve, axis=0), along[:-1]) > 0
+    assert (forwards[1:] != forwards[:-1]).sum() == cusps
 
 
 def test_pixels_cover_both_images_and_seams_are_doubled(bound: tuple[Garment, Body]):
