@@ -314,16 +314,14 @@ def _print_cells(cells: Mapping[str, _Result], printed: Mapping[str, tuple[float
 
 
 def _milliseconds(config: WrinkleConfig, repeats: int, threads: int) -> float:
-    """Median wall time of one map, batch 1, not amortised; fresh weights cost what trained ones do."""
+    """Median wall time of one map of the size on disk, batch 1, not amortised; fresh weights cost what others do."""
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     network = UNet(config.network).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
-    size = config.texels
+    maps = MapConfig()
     nobody = np.zeros((0, 3), np.float32)
-    model = WrinkleModel(
-        network, config.network, texels=size, maps=MapConfig(size=size), layout_digest="", reference=nobody
-    )
-    low = torch.nn.functional.normalize(torch.randn(3, size, size), dim=0)
+    model = WrinkleModel(network, config.network, texels=config.texels, maps=maps, layout_digest="", reference=nobody)
+    low = torch.nn.functional.normalize(torch.randn(3, maps.size, maps.size), dim=0)
     times = []
     for _ in range(repeats + 1):
         begin = time.perf_counter()

@@ -75,9 +75,9 @@ class WrinkleModel:
         if network.output == "residual":
             made = image + made
         if image.shape[-1] != low.shape[-1]:
-            added = (functional.normalize(made, dim=1, eps=1e-6) - image) * shown
+            added = (_unit(made) - image) * shown
             made = low + functional.interpolate(added, size=low.shape[-2:], mode="bilinear", align_corners=False)
-        return functional.normalize(made, dim=1, eps=1e-6)[0] * (low != 0).any(dim=0)
+        return _unit(made)[0] * (low != 0).any(dim=0)
 
     def _in_half_precision(self) -> UNet:
         """A copy of the generator, made once: the weights must not change any more."""
@@ -86,9 +86,14 @@ class WrinkleModel:
         return self._narrow
 
 
+def _unit(image: Tensor) -> Tensor:
+    """What torch's `normalize` does; its norm over channels takes fifty times as long on a CPU."""
+    return image * image.square().sum(dim=1, keepdim=True).clamp(min=1e-12).rsqrt()
+
+
 def _halved(image: Tensor, shown: Tensor) -> tuple[Tensor, Tensor]:
     mean = functional.avg_pool2d(image * shown, 2)
-    return functional.normalize(mean, dim=1, eps=1e-6), (functional.avg_pool2d(shown, 2) > 0).float()
+    return _unit(mean), (functional.avg_pool2d(shown, 2) > 0).float()
 
 
 def save_model(path: str | Path, model: WrinkleModel) -> None:
