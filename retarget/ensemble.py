@@ -17,7 +17,7 @@ from retarget.regressors import Regressor
 __all__ = ["EnsembleRegressor", "ensemble"]
 
 NETWORK_SHARE = 0.25
-"""Weight of the network. From 0.2 to 0.5 the ensemble errs the same to 2 % (`python -m benchmarks regression`)."""
+"""Weight of the network. From 0.2 to 0.5 the ensemble errs the same to 2 %."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

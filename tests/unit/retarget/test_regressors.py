@@ -305,11 +305,20 @@ def weights(regressor: LstmRegressor) -> dict[str, bytes]:
     return {name: each.numpy().tobytes() for name, each in regressor.network.state_dict().items()}
 
 
-def test_a_run_that_stopped_anywhere_ends_with_the_same_bits(clips, tmp_path: Path, monkeypatch) -> None:
+@pytest.mark.parametrize("fitted", [False, True])
+def test_a_run_that_stopped_anywhere_ends_with_the_same_bits(clips, tmp_path: Path, monkeypatch, fitted: bool) -> None:
+    """The network alone, and as `fit` learns it: over a linear regression, with validation and then from all clips."""
     known = clips(count=3)
     config = TrainingConfig(epochs=5, batch=16, checkpoint_s=0.0, teacher_forcing=0.5)
+    lesson, over = FittingClips.create(known[:2], known[2:]), LstmConfig(layers=2, size=24)
+    linear = fit_linear(lesson, layout(), spread(known), LinearConfig())
 
     def go(folder: Path) -> LstmRegressor:
+        if fitted:
+            return fit_lstm(
+                lesson, layout(), spread(known), folder,
+                lstm=over, config=config, linear=linear, linear_config=LinearConfig(),
+            )  # fmt: skip
         return train_lstm(known[:2], known[2:], layout(), spread(known), folder, lstm=SMALL, config=config)
 
     whole = go(tmp_path / "whole")
@@ -326,7 +335,7 @@ def test_a_run_that_stopped_anywhere_ends_with_the_same_bits(clips, tmp_path: Pa
 
         return counted
 
-    for limit in (3, 12, 20):  # three stops of one run
+    for limit in (3, 12, 20, *([8] if fitted else [])):  # stops of one run; the last among all clips
         done = 0
         monkeypatch.setattr(torch.optim.Adam, "step", stop_after(limit))
         with pytest.raises(KeyboardInterrupt):
@@ -334,7 +343,9 @@ def test_a_run_that_stopped_anywhere_ends_with_the_same_bits(clips, tmp_path: Pa
         torch.manual_seed(limit)  # whatever happens in between
     monkeypatch.setattr(torch.optim.Adam, "step", step)
     assert weights(go(tmp_path / "stopped")) == weights(whole)
-    assert (tmp_path / "stopped" / "metrics.jsonl").read_bytes() == (tmp_path / "whole" / "metrics.jsonl").read_bytes()
+    for part in ("training", "final") if fitted else (".",):
+        logs = [tmp_path / name / part / "metrics.jsonl" for name in ("stopped", "whole")]
+        assert logs[0].read_bytes() == logs[1].read_bytes()
 
 
 TRAIN = """
