@@ -17,7 +17,7 @@ from retarget.regressors import Regressor
 __all__ = ["EnsembleRegressor", "ensemble"]
 
 NETWORK_SHARE = 0.25
-"""Weight of the network. From 0.2 to 0.5 the ensemble errs the same to 2 %."""
+"""Weight of the network. At 0.4 the ensemble's mean square is within 2 % of what it is here, at 0.5 within 4 %."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

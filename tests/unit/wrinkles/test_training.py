@@ -76,7 +76,8 @@ def test_a_step_follows_the_gradient_of_the_loss_as_written(kind: TemporalLoss):
     logits = state.discriminator(batch.low, made * batch.valid)  # it has made its step, and stands
     (gan_loss(logits, real=True) + 100 * data + 50 * temporal).backward()
     for mine, own in zip(state.generator.parameters(), twin.parameters(), strict=True):
-        assert mine.grad is not None and own.grad is not None  # noqa: PT018
+        assert mine.grad is not None
+        assert own.grad is not None
         torch.testing.assert_close(mine.grad, own.grad, rtol=1e-3, atol=1e-5 * float(own.grad.abs().max()) + 1e-7)
 
 
