@@ -79,6 +79,24 @@ class LinearConfig:
 
 
 @dataclass(frozen=True)
+class KernelTuningConfig:
+    """Tuning of the kernels by leaving out each take in turn."""
+
+    enabled: bool = True
+    """Off: a control counts by as much as the linear regression says, and all kinds of kernels alike."""
+    least_takes: int = 3
+    """With fewer takes there is nothing to tell by."""
+    frames: int = 1100
+    """From so many frames, evenly spread; time grows with their cube."""
+    rounds: int = 40
+    """Steps of L-BFGS at most."""
+    restraint: float = 0.002
+    """Penalty on the squared logarithms of the factors, beside the logarithm of the mean squared error."""
+    kept: float = 0.995
+    """Share of the coefficients' square in the principal directions that are looked at."""
+
+
+@dataclass(frozen=True)
 class KernelConfig:
     """Kernel ridge regression from control vectors to coefficients."""
 
@@ -91,8 +109,9 @@ class KernelConfig:
     side_length: float = 1.5
     """The same of the kernels over the sides of the body."""
     ridges: tuple[float, ...] = (0.15,)
-    """Penalty; a frame's likeness to itself is 1. Of several the validation clips choose, badly if they are few; this
-    one was best when each clip was left out in turn."""
+    """Penalty; a frame's likeness to itself is 1 before tuning, which goes by the first. Of several the validation
+    clips choose, badly if they are few."""
+    tuning: KernelTuningConfig = field(default_factory=KernelTuningConfig)
     most_frames: int = 4000
     """Learn from no more frames than so many, evenly spread: memory grows with their square, time with their cube."""
 
@@ -171,6 +190,10 @@ def check_fit(config: FitConfig) -> None:
         "shape.most_components": (shape.most_components, 1),
         "shape.filling_rounds": (shape.filling_rounds, 0),
         "kernel.most_frames": (kernel.most_frames, 2),
+        "kernel.tuning.least_takes": (kernel.tuning.least_takes, 2),
+        "kernel.tuning.frames": (kernel.tuning.frames, 2),
+        "kernel.tuning.rounds": (kernel.tuning.rounds, 1),
+        "kernel.tuning.restraint": (kernel.tuning.restraint, 0),
         "lstm.layers": (config.lstm.layers, 1),
         "lstm.size": (config.lstm.size, 1),
         "lstm.window": (config.lstm.window, 1),
@@ -194,6 +217,8 @@ def check_fit(config: FitConfig) -> None:
     for name, ridges in (("linear.ridges", config.linear.ridges), ("kernel.ridges", kernel.ridges)):
         if not ridges or min(ridges) < 0 or (name == "kernel.ridges" and min(ridges) == 0):
             raise InputError(f"{name}: expected positive penalties, found {' '.join(map(str, ridges)) or 'none'}")
+    if not 0 < kernel.tuning.kept <= 1:
+        raise InputError(f"kernel.tuning.kept: expected a share above 0, up to 1, found {kernel.tuning.kept:g}")
     if not 0 <= config.split.validation_share < 1:
         found = config.split.validation_share
         raise InputError(f"split.validation_share: expected a share from 0 to below 1, found {found:g}")

@@ -8,7 +8,8 @@ for a control counts by as much as it moves the garment:
 - over each of these again: two frames are alike if the joints there are turned alike, each rotation weighted by how far
   the garment moves with it.
 
-So a fold at one shoulder is learned without waiting for every pose of the other.
+So a fold at one shoulder is learned without waiting for every pose of the other. Where there are takes enough, all
+this is then tuned so that takes foretell each other (`kernel_tuning`).
 
 Letters: N learned frames, D controls, K coefficients, V views.
 """
@@ -21,7 +22,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64
+from jaxtyping import Float, Float32, Float64, Int64
 from scipy.linalg import cho_factor, cho_solve
 
 from capture4d.errors import InputError
@@ -57,7 +58,7 @@ class KernelRegressor:
     views: tuple[Float32[np.ndarray, "controls _"], ...]
     """From standardised controls to what a kernel compares; frames a distance of 1 apart are alike by exp(-1/2)."""
     shares: Float32[np.ndarray, " views"]
-    """Weights of the kernels, 1 in all."""
+    """Weights of the kernels; 1 in all before they are tuned."""
     frames: Float32[np.ndarray, "learned controls"]
     """Standardised controls of the learned frames."""
     answers: Float32[np.ndarray, "learned shapes"]
@@ -116,9 +117,10 @@ def _fit(
 ) -> list[KernelRegressor]:
     """One regressor for each ridge."""
     controls, wanted = good_frames(clips)
+    takes = np.concatenate([np.full(int(clip.good.sum()), clip.take) for clip in clips])
     scales = Scales.of(controls, np.asarray(std, np.float32), layout)
     known, middle = scales.standardised(controls), wanted.mean(axis=0)
-    views, shares = _views(known, wanted, layout, config)
+    views, shares = _views(known, wanted - middle, takes, layout, config, ridges[0])
     if len(known) > config.most_frames:
         kept = np.linspace(0, len(known) - 1, config.most_frames).round().astype(int)
         known, wanted = known[kept], wanted[kept]
@@ -139,25 +141,45 @@ def _fit(
 
 def _views(
     known: Float32[np.ndarray, "frames controls"],
-    wanted: Float64[np.ndarray, "frames shapes"],
+    offsets: Float64[np.ndarray, "frames shapes"],
+    takes: Int64[np.ndarray, " frames"],
     layout: ControlLayout,
     config: KernelConfig,
+    ridge: float,
 ) -> tuple[tuple[Float32[np.ndarray, "controls _"], ...], Float32[np.ndarray, " views"]]:
     """What the kernels compare, and their weights: everything has a third, what the sides contribute another, and their
-    rotations the last."""
-    response = usual_response(known, wanted)
+    rotations the last; then tuned."""
+    response = _shortened(usual_response(known, offsets))
     relevance = np.linalg.norm(response, axis=1)
     squares = relevance**2 / max(float((relevance**2).sum()), 1e-30)
     places = config.length * _usual_square(known @ response)
     turns = config.side_length * _usual_square(known * relevance)
-    views, sides = [response / np.sqrt(places)], []
+    views, kinds = [response / np.sqrt(places)], [0]
     for now, ever in _sides(layout):
         if squares[now].sum() > STILL:
-            sides.append(np.where(ever[:, None], response, 0) / np.sqrt(places * squares[ever].sum()))
-            sides.append(np.diag(np.where(now, relevance, 0))[:, now] / np.sqrt(turns * squares[now].sum()))
-    views += sides
-    weights = np.array([1.0] + [2.0 / len(sides) for _ in sides], np.float32)
-    return tuple(view.astype(np.float32) for view in views), weights / weights.sum()
+            views.append(np.where(ever[:, None], response, 0) / np.sqrt(places * squares[ever].sum()))
+            views.append(np.diag(np.where(now, relevance, 0))[:, now] / np.sqrt(turns * squares[now].sum()))
+            kinds += [1, 2]
+    weights = np.array([1.0 if kind == 0 else 2.0 / (len(kinds) - 1) for kind in kinds])
+    weights /= weights.sum()
+    if config.tuning.enabled:
+        from retarget.kernel_tuning import tune_kernels  # torch takes a second to load
+
+        tuned = tune_kernels(
+            known, offsets, takes,
+            views=views, shares=weights, kinds=kinds, groups=_groups(layout), ridge=ridge, config=config.tuning,
+        )  # fmt: skip
+        if tuned is not None:
+            views = [tuned.controls[:, None] * view / width for view, width in zip(views, tuned.widths, strict=True)]
+            weights = weights * tuned.shares
+    return tuple(view.astype(np.float32) for view in views), weights.astype(np.float32)
+
+
+def _shortened(response: Float64[np.ndarray, "controls shapes"]) -> Float64[np.ndarray, "controls directions"]:
+    """The same lengths and distances in fewer numbers, up to a millionth of their square."""
+    left, values, _ = np.linalg.svd(response, full_matrices=False)
+    held = np.cumsum(values**2) / max(float((values**2).sum()), 1e-30)
+    return (left * values)[:, : int(np.searchsorted(held, 1 - 1e-6)) + 1]
 
 
 def _usual_square(features: Float64[np.ndarray, "frames features"]) -> float:
@@ -165,16 +187,21 @@ def _usual_square(features: Float64[np.ndarray, "frames features"]) -> float:
     return max(2 * float(features.var(axis=0).sum()), 1e-30)
 
 
+def _opposite(layout: ControlLayout) -> Int64[np.ndarray, " joints"]:
+    """Partners of the garment's joints; themselves, where the joints' names tell no sides."""
+    joints = np.array(layout.joints, int)
+    try:
+        return opposite_joints(layout.joint_names)[joints]
+    except InputError:
+        return joints
+
+
 def _sides(layout: ControlLayout) -> list[tuple[np.ndarray, np.ndarray]]:
     """Controls of the joints in the middle, on one side, on the other, (D,) bool each: their rotations now, and those
     with how far they have come. All joints together, where their names tell no sides."""
-    try:
-        opposite = opposite_joints(layout.joint_names)
-    except InputError:
-        opposite = np.arange(len(layout.joint_names))
-    joints = np.array(layout.joints, int)
+    joints, opposite = np.array(layout.joints, int), _opposite(layout)
     found = []
-    for side in (opposite[joints] == joints, opposite[joints] > joints, opposite[joints] < joints):
+    for side in (opposite == joints, opposite > joints, opposite < joints):
         if side.any():
             rotations = np.tile(np.repeat(side, 6), layout.rotation_sets)
             lags = np.tile(rotations, len(layout.config.lags))
@@ -182,6 +209,18 @@ def _sides(layout: ControlLayout) -> list[tuple[np.ndarray, np.ndarray]]:
             now = np.concatenate([rotations, between, np.zeros(len(lags), bool)])
             found.append((now, np.concatenate([rotations, between, lags])))
     return found
+
+
+def _groups(layout: ControlLayout) -> Int64[np.ndarray, " controls"]:
+    """Which controls are tuned as one, (D,) numbers from 0: the rotations of a joint with those of its partner, and all
+    that there is of any other kind."""
+    _, pairs = np.unique(np.minimum(layout.joints, _opposite(layout)), return_inverse=True)
+    sets, lags = layout.rotation_sets, len(layout.config.lags)
+    others = layout.kinds[sets : len(layout.kinds) - lags]
+    parts = [number * (pairs.max(initial=0) + 1) + np.repeat(pairs, 6) for number in range(sets)]
+    for count in (*others, *(6 * len(layout.joints) for _ in range(sets * lags))):
+        parts.append(np.full(count, parts[-1].max(initial=0) + 1))
+    return np.concatenate(parts)
 
 
 def _seen(

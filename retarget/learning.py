@@ -125,7 +125,8 @@ def regression_clips(
                 coefficients[good] = project(space, *(frames if mirror is None else mirror.frames(*frames)))
             projected[piece, mirror is None] = coefficients
         poses = take.poses if mirror is None else mirror.poses(take.poses)
-        clips.append(Clip(control_vectors(layout, poses)[kept], projected[piece, mirror is None], good))
+        controls = control_vectors(layout, poses)[kept]
+        clips.append(Clip(controls, projected[piece, mirror is None], good, piece.take))
     return clips
 
 

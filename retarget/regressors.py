@@ -9,7 +9,7 @@ Letters: T frames, D controls (with the history), K coefficients.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
@@ -66,6 +66,8 @@ class Clip:
     coefficients: Float32[np.ndarray, "frames shapes"]
     good: np.ndarray
     """(T,) bool: frames whose coefficients are known; the others only lead up to them."""
+    take: int = 0
+    """Number of the take that it is from, or a mirror image of."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -203,7 +205,7 @@ def with_history(clip: Clip, frames: int, std: Float32[np.ndarray, " shapes"]) -
     whitened = np.where(clip.good[:, None], clip.coefficients / std, 0).astype(np.float32)
     past = [np.concatenate([np.zeros_like(whitened[:step]), whitened[:-step]]) for step in range(1, frames + 1)]
     past = [each[: len(whitened)] for each in past]
-    return Clip(np.concatenate([clip.controls, *past], axis=1), clip.coefficients, clip.good)
+    return replace(clip, controls=np.concatenate([clip.controls, *past], axis=1))
 
 
 def mean_squared_error(regressor: Regressor, clips: Sequence[Clip]) -> float:

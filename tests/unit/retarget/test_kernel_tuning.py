@@ -1,0 +1,89 @@
+"""Kernels tuned by leaving out takes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from capture4d.types import PoseSequence
+from retarget.config import ControlConfig, KernelConfig, KernelTuningConfig
+from retarget.controls import ControlLayout, control_vectors
+from retarget.kernel import KernelRegressor, fit_kernel
+from retarget.kernel_tuning import left_out_errors
+from retarget.regressors import Clip, FittingClips, mean_squared_error
+
+NAMES = ("root", "spine", "arm.L", "arm.R", "neck")
+CHOSEN = ControlLayout(NAMES, (1, 2, 3, 4), 60.0, ControlConfig(root_motion=False))
+UNTUNED = KernelConfig(ridges=(1e-2,), tuning=KernelTuningConfig(enabled=False))
+TUNED = replace(UNTUNED, tuning=KernelTuningConfig())
+
+
+def take(number: int, frames: int = 40) -> Clip:
+    """Arms bend the garment, each its own side; the neck turns as far and does nothing."""
+    rng = np.random.default_rng(number)
+    angles = rng.uniform(0.2, 1, 3) * np.sin(rng.uniform(0, 6, 3) + np.linspace(0, 3, frames)[:, None])
+    rotations = np.tile(np.eye(3, dtype=np.float32), (frames, 5, 1, 1))
+    for joint, angle in zip((2, 3, 4), angles.T, strict=True):
+        rotations[:, joint] = Rotation.from_euler("z", angle[:, None]).as_matrix()
+    still, shape = np.zeros((frames, 3), np.float32), np.zeros(2, np.float32)
+    poses = PoseSequence(rotations, still, shape, np.arange(frames, dtype=np.int32), 60.0, NAMES)
+    wanted = np.stack([np.cos(3 * angles[:, 0]), np.cos(3 * angles[:, 1])], axis=1).astype(np.float32)
+    return Clip(control_vectors(CHOSEN, poses), wanted, np.ones(frames, bool), number)
+
+
+def fitted(clips: list[Clip], config: KernelConfig) -> KernelRegressor:
+    return fit_kernel(FittingClips.create(clips), CHOSEN, np.ones(2), config)
+
+
+def test_errors_of_takes_left_out_are_those_of_regressions_without_them() -> None:
+    rng = np.random.default_rng(0)
+    known, wanted = rng.standard_normal((30, 4)), rng.standard_normal((30, 3))
+    takes = np.repeat([0, 1, 2], [12, 10, 8])
+    likeness = np.exp(-0.5 * ((known[:, None] - known) ** 2).sum(axis=2))
+    blocks = [np.flatnonzero(takes == each) for each in range(3)]
+    whole = torch.from_numpy(likeness + 0.1 * np.eye(30))
+    found = left_out_errors(whole, torch.from_numpy(wanted), [torch.from_numpy(block) for block in blocks])
+    for block, errors in zip(blocks, found, strict=True):
+        rest = np.setdiff1d(np.arange(30), block)
+        answers = np.linalg.solve(likeness[np.ix_(rest, rest)] + 0.1 * np.eye(len(rest)), wanted[rest])
+        np.testing.assert_allclose(errors, wanted[block] - likeness[np.ix_(block, rest)] @ answers, atol=1e-10)
+
+
+def test_a_control_that_tells_nothing_counts_less_and_unseen_takes_are_foretold_better() -> None:
+    learned, unseen = [take(number) for number in range(6)], [take(number) for number in range(20, 26)]
+    before, after = fitted(learned, UNTUNED), fitted(learned, TUNED)
+    assert mean_squared_error(after, unseen) < 0.8 * mean_squared_error(before, unseen)
+
+    def counts(found: KernelRegressor) -> np.ndarray:
+        """How far everything moves with each joint."""
+        return np.linalg.norm(found.views[0].reshape(4, -1), axis=1)
+
+    assert counts(after)[3] / counts(after)[1] < 0.8 * counts(before)[3] / counts(before)[1]
+    ratio = np.linalg.norm(after.views[0], axis=1) / np.maximum(np.linalg.norm(before.views[0], axis=1), 1e-12)
+    np.testing.assert_allclose(ratio[6:12][ratio[6:12] > 0], ratio[6], rtol=1e-4)  # a joint is one control,
+    np.testing.assert_allclose(ratio[12], ratio[6], rtol=1e-4)  # and so are both arms
+
+
+@pytest.mark.parametrize("takes", [1, 2])
+def test_few_takes_leave_the_kernels_as_they_are(takes: int) -> None:
+    learned = [replace(take(number), take=number % takes) for number in range(4)]
+    before, after = fitted(learned, UNTUNED), fitted(learned, TUNED)
+    np.testing.assert_array_equal(after.shares, before.shares)
+    np.testing.assert_array_equal(after.answers, before.answers)
+
+
+def test_tuning_looks_at_no_more_frames_than_allowed_and_restraint_holds_it_back() -> None:
+    learned = [take(number) for number in range(4)]
+    before = fitted(learned, UNTUNED)
+
+    def moved(config: KernelTuningConfig) -> float:
+        found = fitted(learned, replace(UNTUNED, tuning=config))
+        assert len(found.frames) == 160
+        return float(np.abs(np.log(found.shares / before.shares)).max())
+
+    assert moved(KernelTuningConfig(restraint=1e4)) < 1e-3 < moved(KernelTuningConfig())
+    assert moved(KernelTuningConfig(frames=40)) != moved(KernelTuningConfig())
