@@ -1,7 +1,7 @@
 """Regression by kernels: a frame's folds are put together from the learned frames whose poses are like its own.
 
-Ridge regression with a sum of Gaussian kernels. What "like" means is taken from a linear regression of the same frames,
-for a control counts by as much as it moves the garment:
+Ridge regression with a sum of Gaussian kernels and a linear one. What "like" means is taken from a linear regression of
+the same frames, for a control counts by as much as it moves the garment:
 
 - over everything: two frames are alike if the linear regression puts the garment in the same place;
 - over each side of the body, and over its middle, the same of what the joints there contribute;
@@ -40,7 +40,7 @@ from retarget.regressors import (
     write_regressor,
 )
 
-__all__ = ["KernelRegressor", "fit_kernel", "load_kernel", "save_kernel"]
+__all__ = ["KernelRegressor", "Views", "fit_kernel", "load_kernel", "save_kernel"]
 
 _KIND = "capture4d kernel regressor"
 BATCH = 1024
@@ -59,6 +59,8 @@ class KernelRegressor:
     """From standardised controls to what a kernel compares; frames a distance of 1 apart are alike by exp(-1/2)."""
     shares: Float32[np.ndarray, " views"]
     """Weights of the kernels; 1 in all before they are tuned."""
+    line: float
+    """Weight of the linear kernel, which compares what the first of the others does."""
     frames: Float32[np.ndarray, "learned controls"]
     """Standardised controls of the learned frames."""
     answers: Float32[np.ndarray, "learned shapes"]
@@ -77,7 +79,7 @@ class KernelRegressor:
 
     def answer(self, known: Float32[np.ndarray, "frames controls"]) -> Float64[np.ndarray, "frames shapes"]:
         """Coefficients of frames, given by standardised controls."""
-        likeness = _likeness(_seen(known, self.views), self._learned, self.shares)
+        likeness = _likeness(_seen(known, self.views), self._learned, self.shares, self.line)
         return likeness @ self.answers + self.middle
 
     @cached_property
@@ -120,35 +122,49 @@ def _fit(
     takes = np.concatenate([np.full(int(clip.good.sum()), clip.take) for clip in clips])
     scales = Scales.of(controls, np.asarray(std, np.float32), layout)
     known, middle = scales.standardised(controls), wanted.mean(axis=0)
-    views, shares = _views(known, wanted - middle, takes, layout, config, ridges[0])
+    seen_by = _tuned(known, wanted - middle, takes, layout, config, ridges[0])
+    views = tuple(view.astype(np.float32) for view in seen_by.matrices)
+    shares, line = seen_by.weights.astype(np.float32), float(seen_by.line)
     if len(known) > config.most_frames:
         kept = np.linspace(0, len(known) - 1, config.most_frames).round().astype(int)
         known, wanted = known[kept], wanted[kept]
     seen = _seen(known, views)
-    likeness = _likeness(seen, seen, shares)
+    likeness = _likeness(seen, seen, shares, line)
     found = []
     for ridge in ridges:
         factor = cho_factor(likeness + ridge * np.eye(len(likeness)), check_finite=False)
         answers = cho_solve(factor, wanted - middle, check_finite=False)
         found.append(
             KernelRegressor(
-                layout, scales, views, shares, known,
+                layout, scales, views, shares, line, known,
                 answers.astype(np.float32), middle.astype(np.float32), ridge,
             )
         )  # fmt: skip
     return found
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Views:
+    """What kernels compare, before it is learned from."""
+
+    matrices: tuple[Float64[np.ndarray, "controls _"], ...]
+    """From standardised controls."""
+    kinds: tuple[int, ...]
+    """0: everything; 1: what a side contributes; 2: how the joints of a side are turned."""
+    weights: Float64[np.ndarray, " views"]
+    """Of the kernels."""
+    line: float
+    """Of the linear kernel over everything."""
+
+
 def _views(
     known: Float32[np.ndarray, "frames controls"],
     offsets: Float64[np.ndarray, "frames shapes"],
-    takes: Int64[np.ndarray, " frames"],
     layout: ControlLayout,
     config: KernelConfig,
-    ridge: float,
-) -> tuple[tuple[Float32[np.ndarray, "controls _"], ...], Float32[np.ndarray, " views"]]:
-    """What the kernels compare, and their weights: everything has a third, what the sides contribute another, and their
-    rotations the last; then tuned."""
+) -> Views:
+    """As a linear regression says: everything has a third of the weight, what the sides contribute another, and their
+    rotations the last."""
     response = _shortened(usual_response(known, offsets))
     relevance = np.linalg.norm(response, axis=1)
     squares = relevance**2 / max(float((relevance**2).sum()), 1e-30)
@@ -162,17 +178,34 @@ def _views(
             kinds += [1, 2]
     weights = np.array([1.0 if kind == 0 else 2.0 / (len(kinds) - 1) for kind in kinds])
     weights /= weights.sum()
-    if config.tuning.enabled:
-        from retarget.kernel_tuning import tune_kernels  # torch takes a second to load
+    return Views(tuple(views), tuple(kinds), weights, config.line * weights[0])
 
-        tuned = tune_kernels(
-            known, offsets, takes,
-            views=views, shares=weights, kinds=kinds, groups=_groups(layout), ridge=ridge, config=config.tuning,
-        )  # fmt: skip
-        if tuned is not None:
-            views = [tuned.controls[:, None] * view / width for view, width in zip(views, tuned.widths, strict=True)]
-            weights = weights * tuned.shares
-    return tuple(view.astype(np.float32) for view in views), weights.astype(np.float32)
+
+def _tuned(
+    known: Float32[np.ndarray, "frames controls"],
+    offsets: Float64[np.ndarray, "frames shapes"],
+    takes: Int64[np.ndarray, " frames"],
+    layout: ControlLayout,
+    config: KernelConfig,
+    ridge: float,
+) -> Views:
+    """The views, tuned if there are takes enough."""
+    views = _views(known, offsets, layout, config)
+    names, takes = np.unique(takes, return_inverse=True)
+    if not config.tuning.enabled or len(names) < config.tuning.least_takes:
+        return views
+    from retarget.kernel_tuning import tune_kernels  # torch takes a second to load
+
+    others = [takes != take for take in range(len(names))]
+    without = [_views(known[rest], offsets[rest], layout, config) for rest in others]
+    found = tune_kernels(known, offsets, takes, without, groups=_groups(layout), ridge=ridge, config=config.tuning)
+    kinds = list(views.kinds)
+    matrices = tuple(
+        found.controls[:, None] * view / width for view, width in zip(views.matrices, found.widths[kinds], strict=True)
+    )
+    # The linear kernel compares what the first view does, before that is widened.
+    line = views.line * found.line * found.widths[0] ** 2
+    return Views(matrices, views.kinds, views.weights * found.shares[kinds], line)
 
 
 def _shortened(response: Float64[np.ndarray, "controls shapes"]) -> Float64[np.ndarray, "controls directions"]:
@@ -233,8 +266,9 @@ def _likeness(
     ours: Sequence[Float64[np.ndarray, "frames _"]],
     theirs: Sequence[Float64[np.ndarray, "others _"]],
     shares: Float[np.ndarray, " views"],
+    line: float,
 ) -> Float64[np.ndarray, "frames others"]:
-    total = np.zeros((len(ours[0]), len(theirs[0])))
+    total = line * ours[0] @ theirs[0].T
     for one, other, share in zip(ours, theirs, shares, strict=True):
         squares = (one**2).sum(axis=1)[:, None] + (other**2).sum(axis=1) - 2 * one @ other.T
         total += float(share) * np.exp(-0.5 * np.maximum(squares, 0))
@@ -255,7 +289,7 @@ def save_kernel(path: Path, regressor: KernelRegressor, *, model_digest: str) ->
         layout=regressor.layout,
         scales=regressor.scales,
         model_digest=model_digest,
-        note={"ridge": regressor.ridge},
+        note={"ridge": regressor.ridge, "line": regressor.line},
     )
 
 
@@ -270,4 +304,5 @@ def load_kernel(path: Path, *, model_digest: str) -> KernelRegressor:
         raise InputError(
             f"{path}: expected learned frames of {wanted[0]} and {wanted[1]}, found {found[0]}, {found[1]}"
         )
-    return KernelRegressor(layout, scales, views, shares, frames, answers, middle, float(file.entry("ridge")))
+    line, ridge = float(file.entry("line")), float(file.entry("ridge"))
+    return KernelRegressor(layout, scales, views, shares, line, frames, answers, middle, ridge)

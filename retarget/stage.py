@@ -59,7 +59,7 @@ from retarget.splits import ROLES, Piece, split_takes
 
 __all__ = ["GarmentModel", "learned_frames", "load_garment_model", "regressor_files", "run"]
 
-SCHEMA = 3
+SCHEMA = 4
 MODEL, LINEAR, KERNEL, LSTM, POSES = (
     f"{name}.safetensors" for name in ("blendshapes", "linear", "kernel", "lstm", "poses")
 )

@@ -6,14 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from scipy.spatial.transform import Rotation
 
 from capture4d.types import PoseSequence
 from retarget.config import ControlConfig, KernelConfig, KernelTuningConfig
 from retarget.controls import ControlLayout, control_vectors
 from retarget.kernel import KernelRegressor, fit_kernel
-from retarget.kernel_tuning import left_out_errors
 from retarget.regressors import Clip, FittingClips, mean_squared_error
 
 NAMES = ("root", "spine", "arm.L", "arm.R", "neck")
@@ -37,20 +35,6 @@ def take(number: int, frames: int = 40) -> Clip:
 
 def fitted(clips: list[Clip], config: KernelConfig) -> KernelRegressor:
     return fit_kernel(FittingClips.create(clips), CHOSEN, np.ones(2), config)
-
-
-def test_errors_of_takes_left_out_are_those_of_regressions_without_them() -> None:
-    rng = np.random.default_rng(0)
-    known, wanted = rng.standard_normal((30, 4)), rng.standard_normal((30, 3))
-    takes = np.repeat([0, 1, 2], [12, 10, 8])
-    likeness = np.exp(-0.5 * ((known[:, None] - known) ** 2).sum(axis=2))
-    blocks = [np.flatnonzero(takes == each) for each in range(3)]
-    whole = torch.from_numpy(likeness + 0.1 * np.eye(30))
-    found = left_out_errors(whole, torch.from_numpy(wanted), [torch.from_numpy(block) for block in blocks])
-    for block, errors in zip(blocks, found, strict=True):
-        rest = np.setdiff1d(np.arange(30), block)
-        answers = np.linalg.solve(likeness[np.ix_(rest, rest)] + 0.1 * np.eye(len(rest)), wanted[rest])
-        np.testing.assert_allclose(errors, wanted[block] - likeness[np.ix_(block, rest)] @ answers, atol=1e-10)
 
 
 def test_a_control_that_tells_nothing_counts_less_and_unseen_takes_are_foretold_better() -> None:
