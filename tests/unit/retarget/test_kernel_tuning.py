@@ -64,10 +64,20 @@ def test_tuning_looks_at_no_more_frames_than_allowed_and_restraint_holds_it_back
     learned = [take(number) for number in range(4)]
     before = fitted(learned, UNTUNED)
 
-    def moved(config: KernelTuningConfig) -> float:
-        found = fitted(learned, replace(UNTUNED, tuning=config))
+    def moved(**settings: float) -> float:
+        """How far the kernels' weights are from untuned ones."""
+        tuning = KernelTuningConfig(rounds=3, **settings)
+        found = fitted(learned, replace(UNTUNED, tuning=tuning))
         assert len(found.frames) == 160
         return float(np.abs(np.log(found.shares / before.shares)).max())
 
-    assert moved(KernelTuningConfig(restraint=1e4)) < 1e-3 < moved(KernelTuningConfig())
-    assert moved(KernelTuningConfig(frames=40)) != moved(KernelTuningConfig())
+    assert moved(restraint=1e4) < 1e-3 < 0.1 < moved()
+    assert moved(frames=40) != moved()
+
+
+def test_the_linear_kernel_goes_on_where_no_learned_frame_is_near() -> None:
+    near = take(0)
+    near.coefficients[:] = near.controls[:, 6:8]
+    far = replace(near, controls=3 * near.controls, coefficients=3 * near.coefficients)
+    curved, straight = (fitted([near], replace(UNTUNED, line=line)) for line in (0.0, 30.0))
+    assert mean_squared_error(straight, [far]) < 0.2 * mean_squared_error(curved, [far])
