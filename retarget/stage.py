@@ -316,9 +316,12 @@ def _regressors(
     save_linear(stage.path / LINEAR, linear, model_digest=digest)
     kernel = network = None
     if config.regressor != "linear":
-        own = ControlLayout.create(body, takes.skin_weights, layout.fps, config.kernel.control)
-        kernel = fit_kernel(fitting_clips(takes, pieces, own, space, mirror, projected), own, space.std, config.kernel)
-        save_kernel(stage.path / KERNEL, kernel, model_digest=digest)
+        if not (stage.path / KERNEL).is_file():
+            own = ControlLayout.create(body, takes.skin_weights, layout.fps, config.kernel.control)
+            wider = fitting_clips(takes, pieces, own, space, mirror, projected)
+            learned = fit_kernel(wider, own, space.std, config.kernel)
+            save_kernel(stage.path / KERNEL, learned, model_digest=digest)
+        kernel = load_kernel(stage.path / KERNEL, model_digest=digest)
     if config.regressor == "all":
         network = _network(stage, lesson, layout, space, linear, config, device, digest)
     note: dict[str, Any] = {
