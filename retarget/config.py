@@ -86,6 +86,9 @@ class KernelTuningConfig:
     """Off: a control counts by as much as the linear regression says, and all kinds of kernels alike."""
     least_takes: int = 3
     """With fewer takes there is nothing to tell by."""
+    line: float = 0.1
+    """Weight with which a linear kernel begins, beside 1 of all others. It goes on where no learned frame is near, for
+    better or worse, so without tuning there is none."""
     frames: int = 600
     """From so many frames, evenly spread; time grows with their cube."""
     rounds: int = 30
@@ -109,8 +112,6 @@ class KernelConfig:
     """Square of the width of the kernel over everything, relative to the mean squared distance of two frames."""
     side_length: float = 1.5
     """The same of the kernels over the sides of the body."""
-    line: float = 0.3
-    """Weight of a linear kernel beside the one over everything: it goes on where no learned frame is near."""
     ridges: tuple[float, ...] = (0.15,)
     """Penalty; a frame's likeness to itself is 1 before tuning, which goes by the first. Of several the validation
     clips choose, badly if they are few."""
@@ -197,7 +198,7 @@ def check_fit(config: FitConfig) -> None:
         "kernel.tuning.frames": (kernel.tuning.frames, 2),
         "kernel.tuning.rounds": (kernel.tuning.rounds, 1),
         "kernel.tuning.restraint": (kernel.tuning.restraint, 0),
-        "kernel.line": (kernel.line, 0),
+        "kernel.tuning.line": (kernel.tuning.line, 0),
         "lstm.layers": (config.lstm.layers, 1),
         "lstm.size": (config.lstm.size, 1),
         "lstm.window": (config.lstm.window, 1),

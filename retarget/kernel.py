@@ -60,7 +60,7 @@ class KernelRegressor:
     shares: Float32[np.ndarray, " views"]
     """Weights of the kernels; 1 in all before they are tuned."""
     line: float
-    """Weight of the linear kernel, which compares what the first of the others does."""
+    """Weight of the linear kernel, which compares what the first of the others does; 0 without tuning."""
     frames: Float32[np.ndarray, "learned controls"]
     """Standardised controls of the learned frames."""
     answers: Float32[np.ndarray, "learned shapes"]
@@ -153,7 +153,7 @@ class Views:
     """0: everything; 1: what a side contributes; 2: how the joints of a side are turned."""
     weights: Float64[np.ndarray, " views"]
     """Of the kernels."""
-    line: float
+    line: float = 0.0
     """Of the linear kernel over everything."""
 
 
@@ -178,7 +178,7 @@ def _views(
             kinds += [1, 2]
     weights = np.array([1.0 if kind == 0 else 2.0 / (len(kinds) - 1) for kind in kinds])
     weights /= weights.sum()
-    return Views(tuple(views), tuple(kinds), weights, config.line * weights[0])
+    return Views(tuple(views), tuple(kinds), weights)
 
 
 def _tuned(
@@ -204,7 +204,7 @@ def _tuned(
         found.controls[:, None] * view / width for view, width in zip(views.matrices, found.widths[kinds], strict=True)
     )
     # The linear kernel compares what the first view does, before that is widened.
-    line = views.line * found.line * found.widths[0] ** 2
+    line = found.line * found.widths[0] ** 2
     return Views(matrices, views.kinds, views.weights * found.shares[kinds], line)
 
 

@@ -30,7 +30,7 @@ LARGEST = 6.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tuning:
-    """Factors; all 1 before tuning."""
+    """Factors, all 1 before tuning, and the weight of the linear kernel."""
 
     controls: Float64[np.ndarray, " controls"]
     """Of the standardised controls."""
@@ -39,7 +39,7 @@ class Tuning:
     shares: Float64[np.ndarray, " kinds"]
     """Of the weight of each kind of view."""
     line: float
-    """Of the weight of the linear kernel."""
+    """The weight itself."""
 
 
 def tune_kernels(
@@ -70,7 +70,7 @@ def tune_kernels(
 
     def factors(logs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
         relevance, widths, shares, line = logs.split(sizes)
-        return (relevance / 2).exp()[group], widths.exp(), shares.exp(), line.exp()
+        return (relevance / 2).exp()[group], widths.exp(), shares.exp(), config.line * line.exp()
 
     def loss(logs: np.ndarray) -> tuple[float, np.ndarray]:
         at = torch.from_numpy(logs.copy()).requires_grad_()
@@ -100,7 +100,6 @@ class _Fold:
     views: list[torch.Tensor]
     kinds: tuple[int, ...]
     weights: list[float]
-    line: float
 
     @staticmethod
     def create(inside: np.ndarray, views: Views) -> _Fold:
@@ -110,7 +109,6 @@ class _Fold:
             [torch.from_numpy(view) for view in views.matrices],
             views.kinds,
             views.weights.tolist(),
-            views.line,
         )
 
     def squared_error(
@@ -124,7 +122,7 @@ class _Fold:
     ) -> torch.Tensor:
         """Mean over the take's frames of what ridge regression from the others is off, squared."""
         everything = controls @ self.views[0]
-        alike = self.line * line * everything @ everything[self.outside].T
+        alike = line * everything @ everything[self.outside].T
         for view, kind, weight in zip(self.views, self.kinds, self.weights, strict=True):
             features = controls @ view
             squares = _squares(features, features[self.outside])

@@ -76,8 +76,12 @@ def test_tuning_looks_at_no_more_frames_than_allowed_and_restraint_holds_it_back
 
 
 def test_the_linear_kernel_goes_on_where_no_learned_frame_is_near() -> None:
-    near = take(0)
-    near.coefficients[:] = near.controls[:, 6:8]
-    far = replace(near, controls=3 * near.controls, coefficients=3 * near.coefficients)
-    curved, straight = (fitted([near], replace(UNTUNED, line=line)) for line in (0.0, 30.0))
-    assert mean_squared_error(straight, [far]) < 0.2 * mean_squared_error(curved, [far])
+    learned = [take(number) for number in range(4)]
+    for clip in learned:
+        clip.coefficients[:] = clip.controls[:, 6:8]
+    far = [replace(clip, controls=3 * clip.controls, coefficients=3 * clip.coefficients) for clip in learned]
+    curved, straight = (
+        fitted(learned, replace(UNTUNED, tuning=KernelTuningConfig(line=line, restraint=1e3))) for line in (0.0, 100.0)
+    )
+    assert fitted(learned, UNTUNED).line == curved.line == 0 < straight.line
+    assert mean_squared_error(straight, far) < 0.1 * mean_squared_error(curved, far)

@@ -313,7 +313,7 @@ def test_a_tracked_take_is_never_written_over(model: Path, works, tmp_path: Path
         (("--shape.components", "-1"), "shape.components: expected at least 0, found -1"),
         (("--kernel.ridges", "0"), "kernel.ridges: expected positive penalties, found 0.0"),
         (("--kernel.tuning.kept", "0"), "kernel.tuning.kept: expected a share above 0, up to 1, found 0"),
-        (("--kernel.line", "-1"), "kernel.line: expected at least 0, found -1"),
+        (("--kernel.tuning.line", "-1"), "kernel.tuning.line: expected at least 0, found -1"),
         (("--control.lags", "-1"), "control.lags: expected at least 1, found -1"),
         (("--kernel.control.history", "2"), "kernel.control.history: expected 0, found 2"),
         (("--split.validation-share", "1"), "split.validation_share: expected a share from 0 to below 1, found 1"),
