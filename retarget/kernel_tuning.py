@@ -62,6 +62,7 @@ def tune_kernels(
         groups: which controls share a factor: 0, 1, ...
     """
     rows = np.linspace(0, len(known) - 1, min(len(known), config.frames)).round().astype(int)
+    ridge *= len(rows) / len(known)  # each of them stands for several, whose errors are averaged
     controls = torch.from_numpy(known[rows].astype(np.float64))
     wanted = torch.from_numpy(_main_directions(offsets[rows], config.kept))
     folds = [_Fold.create(takes[rows] == take, views) for take, views in enumerate(without) if take in takes[rows]]
