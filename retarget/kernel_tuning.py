@@ -75,9 +75,9 @@ def tune_kernels(
 
     def loss(logs: np.ndarray) -> tuple[float, np.ndarray]:
         at = torch.from_numpy(logs.copy()).requires_grad_()
-        scale, *others = factors(at)
+        scale, widths, shares, line = factors(at)
         seen = controls * scale
-        errors = torch.stack([fold.squared_error(seen, wanted, *others, ridge) for fold in folds])
+        errors = torch.stack([fold.squared_error(seen, wanted, widths, shares, line, ridge) for fold in folds])
         total = errors.clamp(min=1e-30).log().mean() + config.restraint * (at**2).sum()
         total.backward()
         assert at.grad is not None
