@@ -94,8 +94,8 @@ class KernelTuningConfig:
     rounds: int = 30
     """Steps of L-BFGS at most."""
     restraint: float = 0.01
-    """Penalty on the squared logarithms of the factors, beside the mean logarithm of the takes' squared errors. It and
-    the rest here did best on takes that were kept even from the tuning."""
+    """Penalty on the squared logarithms of the factors, beside the mean logarithm of the takes' squared errors;
+    chosen on takes that were kept even from the tuning."""
     kept: float = 0.995
     """Share of the coefficients' square in the principal directions that are looked at."""
 

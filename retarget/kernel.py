@@ -28,25 +28,22 @@ from scipy.linalg import cho_factor, cho_solve
 from capture4d.errors import InputError
 from retarget.config import KernelConfig
 from retarget.controls import ControlLayout
-from retarget.mirroring import opposite_joints
+from retarget.kernel_views import Views, control_groups, kernel_views, likeness
 from retarget.regressors import (
     Clip,
     FittingClips,
     Scales,
     good_frames,
     read_regressor,
-    usual_response,
     with_best_ridge,
     write_regressor,
 )
 
-__all__ = ["KernelRegressor", "Views", "fit_kernel", "load_kernel", "save_kernel"]
+__all__ = ["KernelRegressor", "fit_kernel", "load_kernel", "save_kernel"]
 
 _KIND = "capture4d kernel regressor"
 BATCH = 1024
 """Frames that are answered together."""
-STILL = 1e-6
-"""A side that moves the garment by less than this share of what everything does has no kernels of its own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,8 +76,8 @@ class KernelRegressor:
 
     def answer(self, known: Float32[np.ndarray, "frames controls"]) -> Float64[np.ndarray, "frames shapes"]:
         """Coefficients of frames, given by standardised controls."""
-        likeness = _likeness(_seen(known, self.views), self._learned, self.shares, self.line)
-        return likeness @ self.answers + self.middle
+        alike = likeness(_seen(known, self.views), self._learned, self.shares, self.line)
+        return alike @ self.answers + self.middle
 
     @cached_property
     def _learned(self) -> list[Float64[np.ndarray, "learned _"]]:
@@ -129,10 +126,10 @@ def _fit(
         kept = np.linspace(0, len(known) - 1, config.most_frames).round().astype(int)
         known, wanted = known[kept], wanted[kept]
     seen = _seen(known, views)
-    likeness = _likeness(seen, seen, shares, line)
+    alike = likeness(seen, seen, shares, line)
     found = []
     for ridge in ridges:
-        factor = cho_factor(likeness + ridge * np.eye(len(likeness)), check_finite=False)
+        factor = cho_factor(alike + ridge * np.eye(len(alike)), check_finite=False)
         answers = cho_solve(factor, wanted - middle, check_finite=False)
         found.append(
             KernelRegressor(
@@ -141,44 +138,6 @@ def _fit(
             )
         )  # fmt: skip
     return found
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Views:
-    """What kernels compare, before it is learned from."""
-
-    matrices: tuple[Float64[np.ndarray, "controls _"], ...]
-    """From standardised controls."""
-    kinds: tuple[int, ...]
-    """0: everything; 1: what a side contributes; 2: how the joints of a side are turned."""
-    weights: Float64[np.ndarray, " views"]
-    """Of the kernels."""
-    line: float = 0.0
-    """Of the linear kernel over everything."""
-
-
-def _views(
-    known: Float32[np.ndarray, "frames controls"],
-    offsets: Float64[np.ndarray, "frames shapes"],
-    layout: ControlLayout,
-    config: KernelConfig,
-) -> Views:
-    """As a linear regression says: everything has a third of the weight, what the sides contribute another, and their
-    rotations the last."""
-    response = _shortened(usual_response(known, offsets))
-    relevance = np.linalg.norm(response, axis=1)
-    squares = relevance**2 / max(float((relevance**2).sum()), 1e-30)
-    places = config.length * _usual_square(known @ response)
-    turns = config.side_length * _usual_square(known * relevance)
-    views, kinds = [response / np.sqrt(places)], [0]
-    for now, ever in _sides(layout):
-        if squares[now].sum() > STILL:
-            views.append(np.where(ever[:, None], response, 0) / np.sqrt(places * squares[ever].sum()))
-            views.append(np.diag(np.where(now, relevance, 0))[:, now] / np.sqrt(turns * squares[now].sum()))
-            kinds += [1, 2]
-    weights = np.array([1.0 if kind == 0 else 2.0 / (len(kinds) - 1) for kind in kinds])
-    weights /= weights.sum()
-    return Views(tuple(views), tuple(kinds), weights)
 
 
 def _tuned(
@@ -190,89 +149,24 @@ def _tuned(
     ridge: float,
 ) -> Views:
     """The views, tuned if there are takes enough."""
-    views = _views(known, offsets, layout, config)
+    views = kernel_views(known, offsets, layout, config)
     names, takes = np.unique(takes, return_inverse=True)
     if not config.tuning.enabled or len(names) < config.tuning.least_takes:
         return views
     from retarget.kernel_tuning import tune_kernels  # torch takes a second to load
 
     others = [takes != take for take in range(len(names))]
-    without = [_views(known[rest], offsets[rest], layout, config) for rest in others]
-    found = tune_kernels(known, offsets, takes, without, groups=_groups(layout), ridge=ridge, config=config.tuning)
-    kinds = list(views.kinds)
-    matrices = tuple(
-        found.controls[:, None] * view / width for view, width in zip(views.matrices, found.widths[kinds], strict=True)
+    without = [kernel_views(known[rest], offsets[rest], layout, config) for rest in others]
+    found = tune_kernels(
+        known, offsets, takes, without, groups=control_groups(layout), ridge=ridge, config=config.tuning
     )
-    # The linear kernel compares what the first view does, before that is widened.
-    line = found.line * found.widths[0] ** 2
-    return Views(matrices, views.kinds, views.weights * found.shares[kinds], line)
-
-
-def _shortened(response: Float64[np.ndarray, "controls shapes"]) -> Float64[np.ndarray, "controls directions"]:
-    """The same lengths and distances in fewer numbers, up to a millionth of their square."""
-    left, values, _ = np.linalg.svd(response, full_matrices=False)
-    held = np.cumsum(values**2) / max(float((values**2).sum()), 1e-30)
-    return (left * values)[:, : int(np.searchsorted(held, 1 - 1e-6)) + 1]
-
-
-def _usual_square(features: Float64[np.ndarray, "frames features"]) -> float:
-    """Mean squared distance of two frames; positive."""
-    return max(2 * float(features.var(axis=0).sum()), 1e-30)
-
-
-def _opposite(layout: ControlLayout) -> Int64[np.ndarray, " joints"]:
-    """Partners of the garment's joints; themselves, where the joints' names tell no sides."""
-    joints = np.array(layout.joints, int)
-    try:
-        return opposite_joints(layout.joint_names)[joints]
-    except InputError:
-        return joints
-
-
-def _sides(layout: ControlLayout) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Controls of the joints in the middle, on one side, on the other, (D,) bool each: their rotations now, and those
-    with how far they have come. All joints together, where their names tell no sides."""
-    joints, opposite = np.array(layout.joints, int), _opposite(layout)
-    found = []
-    for side in (opposite == joints, opposite > joints, opposite < joints):
-        if side.any():
-            rotations = np.tile(np.repeat(side, 6), layout.rotation_sets)
-            lags = np.tile(rotations, len(layout.config.lags))
-            between = np.zeros(layout.size - len(rotations) - len(lags), bool)
-            now = np.concatenate([rotations, between, np.zeros(len(lags), bool)])
-            found.append((now, np.concatenate([rotations, between, lags])))
-    return found
-
-
-def _groups(layout: ControlLayout) -> Int64[np.ndarray, " controls"]:
-    """Which controls are tuned as one, (D,) numbers from 0: the rotations of a joint with those of its partner, and all
-    that there is of any other kind."""
-    _, pairs = np.unique(np.minimum(layout.joints, _opposite(layout)), return_inverse=True)
-    sets, lags = layout.rotation_sets, len(layout.config.lags)
-    others = layout.kinds[sets : len(layout.kinds) - lags]
-    parts = [number * (pairs.max(initial=0) + 1) + np.repeat(pairs, 6) for number in range(sets)]
-    for count in (*others, *(6 * len(layout.joints) for _ in range(sets * lags))):
-        parts.append(np.full(count, parts[-1].max(initial=0) + 1))
-    return np.concatenate(parts)
+    return views.tuned(found.controls, found.widths, found.shares, found.line)
 
 
 def _seen(
     known: Float32[np.ndarray, "frames controls"], views: Sequence[Float32[np.ndarray, "controls _"]]
 ) -> list[Float64[np.ndarray, "frames _"]]:
     return [known.astype(np.float64) @ view.astype(np.float64) for view in views]
-
-
-def _likeness(
-    ours: Sequence[Float64[np.ndarray, "frames _"]],
-    theirs: Sequence[Float64[np.ndarray, "others _"]],
-    shares: Float[np.ndarray, " views"],
-    line: float,
-) -> Float64[np.ndarray, "frames others"]:
-    total = line * ours[0] @ theirs[0].T
-    for one, other, share in zip(ours, theirs, shares, strict=True):
-        squares = (one**2).sum(axis=1)[:, None] + (other**2).sum(axis=1) - 2 * one @ other.T
-        total += float(share) * np.exp(-0.5 * np.maximum(squares, 0))
-    return total
 
 
 def save_kernel(path: Path, regressor: KernelRegressor, *, model_digest: str) -> None:

@@ -20,9 +20,9 @@ from jaxtyping import Float32, Float64, Int
 from scipy.optimize import minimize
 
 from retarget.config import KernelTuningConfig
-from retarget.kernel import Views
+from retarget.kernel_views import KINDS, Views, main_directions
 
-__all__ = ["Tuning", "tune_kernels"]
+__all__ = ["Fold", "Tuning", "tune_kernels"]
 
 LARGEST = 6.0
 """No logarithm is tuned beyond this, which keeps the likeness invertible."""
@@ -64,10 +64,10 @@ def tune_kernels(
     rows = np.linspace(0, len(known) - 1, min(len(known), config.frames)).round().astype(int)
     ridge *= len(rows) / len(known)  # each of them stands for several, whose errors are averaged
     controls = torch.from_numpy(known[rows].astype(np.float64))
-    wanted = torch.from_numpy(_main_directions(offsets[rows], config.kept))
-    folds = [_Fold.create(takes[rows] == take, views) for take, views in enumerate(without) if take in takes[rows]]
-    group, kinds = torch.from_numpy(groups), 1 + max(max(views.kinds) for views in without)
-    sizes = [int(groups.max()) + 1, kinds, kinds, 1]
+    wanted = torch.from_numpy(main_directions(offsets[rows], config.kept))
+    folds = [Fold.create(takes[rows] == take, views) for take, views in enumerate(without) if take in takes[rows]]
+    group = torch.from_numpy(groups)
+    sizes = [int(groups.max()) + 1, KINDS, KINDS, 1]
 
     def factors(logs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
         relevance, widths, shares, line = logs.split(sizes)
@@ -94,7 +94,7 @@ def tune_kernels(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Fold:
+class Fold:
     """One take that is left out."""
 
     inside: torch.Tensor
@@ -105,8 +105,8 @@ class _Fold:
     weights: list[float]
 
     @staticmethod
-    def create(inside: np.ndarray, views: Views) -> _Fold:
-        return _Fold(
+    def create(inside: np.ndarray, views: Views) -> Fold:
+        return Fold(
             torch.from_numpy(np.flatnonzero(inside)),
             torch.from_numpy(np.flatnonzero(~inside)),
             [torch.from_numpy(view) for view in views.matrices],
@@ -139,13 +139,3 @@ class _Fold:
 def _squares(ours: torch.Tensor, theirs: torch.Tensor) -> torch.Tensor:
     """Squared distances of all rows to all."""
     return ((ours**2).sum(dim=1)[:, None] + (theirs**2).sum(dim=1) - 2 * ours @ theirs.T).clamp(min=0)
-
-
-def _main_directions(
-    offsets: Float64[np.ndarray, "frames shapes"], kept: float
-) -> Float64[np.ndarray, "frames directions"]:
-    """Offsets along as many principal directions as hold a share of their square; tuning needs no more."""
-    left, values, _ = np.linalg.svd(offsets, full_matrices=False)
-    held = np.cumsum(values**2) / max(float((values**2).sum()), 1e-30)
-    count = int(np.searchsorted(held, kept)) + 1
-    return (left * values)[:, :count]

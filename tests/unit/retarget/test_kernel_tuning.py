@@ -6,12 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from scipy.spatial.transform import Rotation
 
 from capture4d.types import PoseSequence
 from retarget.config import ControlConfig, KernelConfig, KernelTuningConfig
 from retarget.controls import ControlLayout, control_vectors
 from retarget.kernel import KernelRegressor, fit_kernel
+from retarget.kernel_tuning import Fold
+from retarget.kernel_views import kernel_views, likeness
 from retarget.regressors import Clip, FittingClips, mean_squared_error
 
 NAMES = ("root", "spine", "arm.L", "arm.R", "neck")
@@ -85,3 +88,30 @@ def test_the_linear_kernel_goes_on_where_no_learned_frame_is_near() -> None:
     )
     assert fitted(learned, UNTUNED).line == curved.line == 0 < straight.line
     assert mean_squared_error(straight, far) < 0.1 * mean_squared_error(curved, far)
+
+
+def test_tuning_foretells_with_the_kernels_that_are_learned_with() -> None:
+    """What is tuned, and the regression that comes of it, are one and the same: errors of a take that is left out."""
+    clips = [take(number) for number in range(3)]
+    kept, out = (np.concatenate([clip.controls for clip in each]) for each in (clips[:2], clips[2:]))
+    wanted = np.concatenate([clip.coefficients for clip in clips]).astype(np.float64)
+    known = np.concatenate([kept, out]) - kept.mean(axis=0)
+    views = kernel_views(known[:80], wanted[:80] - wanted[:80].mean(axis=0), CHOSEN, UNTUNED)
+    rng = np.random.default_rng(0)
+    controls, widths, shares, line = (
+        rng.uniform(0.5, 2, CHOSEN.size),
+        rng.uniform(0.5, 2, 3),
+        rng.uniform(0.5, 2, 3),
+        0.3,
+    )
+    fold = Fold.create(np.arange(120) >= 80, views)
+    tensors = (torch.from_numpy(each) for each in (known * controls, wanted, widths, shares))
+    found = fold.squared_error(*tensors, torch.tensor(line), 0.1)
+
+    tuned = views.tuned(controls, widths, shares, line)
+    seen = [known.astype(np.float64) @ view for view in tuned.matrices]
+    alike = likeness(seen, seen, tuned.weights, tuned.line)
+    middle = wanted[:80].mean(axis=0)
+    answers = np.linalg.solve(alike[:80, :80] + 0.1 * np.eye(80), wanted[:80] - middle)
+    errors = alike[80:, :80] @ answers + middle - wanted[80:]
+    assert float(found) == pytest.approx((errors**2).sum(axis=1).mean(), rel=1e-8)
