@@ -13,8 +13,8 @@ import numpy as np
 
 from benchmarks.learning_takes import Lesson, lesson, training_set
 from benchmarks.metric import Metric
-from retarget.blendshapes import fewest_directions, learn_shape_space, reconstruct, skin_frames, worst_errors
 from retarget.config import ShapeConfig
+from retarget.shapes.blendshapes import fewest_directions, learn_shape_space, reconstruct, skin_frames, worst_errors
 
 COUNTS = (25, 50, 100, 200, 500)
 VERTICES, DIRECTIONS, JOINTS = 5000, 500, 36

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import KDTree
 
-from capture4d.body import PosedBody
-from capture4d.body_tracking import ScanPoints
-from capture4d.mesh import face_areas, face_normals, vertex_normals
+from capture4d.body.skinning import PosedBody
+from capture4d.geometry.mesh import face_areas, face_normals, vertex_normals
+from capture4d.tracking.scan_points import ScanPoints
 from capture4d.types import Body, Mesh
 
 __all__ = ["DressedBody", "covered_vertices", "dress_body", "sample_scan"]

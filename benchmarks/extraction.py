@@ -19,23 +19,25 @@ import numpy as np
 from rich.console import Console
 from scipy.spatial import KDTree
 
+from benchmarks.cached_takes import cached_take
 from benchmarks.metric import Metric
-from capture4d.body import pose_frame, with_shape
-from capture4d.colour_learning import ColoursNotSeparableError, learn_colours
-from capture4d.evaluation import curve_distances, surface_distances
-from capture4d.garment_extraction import ColourNotFoundError
-from capture4d.records import load_poses
-from capture4d.scans import read_body, read_capture, read_truth_frame, read_truth_model
-from capture4d.take_colours import KnownColours, cut_out
+from capture4d.body.skinning import pose_frame, with_shape
+from capture4d.captures.capture import read_body, read_capture
+from capture4d.captures.take_colours import KnownColours
+from capture4d.captures.truth import read_truth_frame, read_truth_model
+from capture4d.colours.learning import ColoursNotSeparableError, learn_colours
+from capture4d.evaluation import curve_distances
+from capture4d.extraction.garment import ColourNotFoundError, cut_out
+from capture4d.files.records import load_poses
+from capture4d.geometry.closest_points import surface_distances
 from capture4d.types import GarmentScan, Mesh, Scan
-from data_synth.border_paint import PaintedSheet, paint_borders
-from data_synth.cached_takes import cached_take
 from data_synth.config import PRESETS
 from data_synth.outfits import OUTFITS, OutfitName
-from data_synth.raycast import Surface
-from data_synth.rig import bounding_sphere, scanner_rig
-from data_synth.scanner import LABEL_BODY, LABEL_GARMENT, scan_surfaces
-from data_synth.scanner_config import FusionConfig, Lighting, RigConfig, ScannerConfig, ShadingConfig, StereoConfig
+from data_synth.scanner.border_paint import PaintedSheet, paint_borders
+from data_synth.scanner.config import FusionConfig, Lighting, RigConfig, ScannerConfig, ShadingConfig, StereoConfig
+from data_synth.scanner.raycast import Surface
+from data_synth.scanner.rig import bounding_sphere, scanner_rig
+from data_synth.scanner.scan import LABEL_BODY, LABEL_GARMENT, scan_surfaces
 
 OUTFITS_MEASURED: tuple[OutfitName, ...] = ("blue", "red")
 BAND_M = 0.012

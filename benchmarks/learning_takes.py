@@ -9,28 +9,22 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.cached_takes import cached_training_set
 from benchmarks.renewal import renew
 from capture4d.app.pipeline import run_stages
-from capture4d.body import ShapedBody, with_shape
+from capture4d.body.skinning import ShapedBody, with_shape
+from capture4d.captures.capture import Capture, read_body, read_capture, read_template
+from capture4d.captures.truth import read_truth_model, read_truth_vertices
+from capture4d.captures.work_folder import load_moving_body, load_records, load_registration
 from capture4d.evaluation import material_points
-from capture4d.records import load_poses
-from capture4d.scans import (
-    Capture,
-    read_body,
-    read_capture,
-    read_template,
-    read_truth_model,
-    read_truth_vertices,
-)
+from capture4d.files.records import load_poses
 from capture4d.types import Garment, PoseSequence, RegisteredSequence
-from capture4d.work_folder import load_moving_body, load_records, load_registration
-from data_synth.cached_takes import cached_training_set
 from data_synth.config import TRAINING_SETS, TrainingSetConfig
 from registration.config import RegistrationConfig
 from retarget.config import ShapeConfig
-from retarget.learning import Take, UnposedTakes
-from retarget.pose_normalisation import PoseRows, unpose_sequence
-from retarget.splits import Piece, Role
+from retarget.regression.learning import Take, UnposedTakes
+from retarget.regression.splits import Piece, Role
+from retarget.shapes.pose_normalisation import PoseRows, unpose_sequence
 
 __all__ = ["Lesson", "learned_takes", "lesson", "registered_takes", "training_set", "true_places", "true_take"]
 

@@ -20,18 +20,19 @@ import numpy as np
 
 from benchmarks.metric import Metric
 from benchmarks.registered_work import QUICK_TAKE, locate_texels, registered_work
-from capture4d.body import pose_frame, with_shape
-from capture4d.garment_stage import load_garment_scan
-from capture4d.mesh import normalised, vertex_normals
-from capture4d.open3d_loading import import_open3d
-from capture4d.records import load_poses, load_rig
-from capture4d.scans import Capture, read_body, read_capture, read_truth_frame, read_truth_model
+from capture4d.body.skinning import pose_frame, with_shape
+from capture4d.captures.capture import Capture, read_body, read_capture
+from capture4d.captures.garment_scans import load_garment_scan
+from capture4d.captures.truth import read_truth_frame, read_truth_model
+from capture4d.captures.work_folder import load_registration
+from capture4d.files.records import load_poses, load_rig
+from capture4d.geometry.mesh import normalised, vertex_normals
+from capture4d.geometry.uv_layout import millimetres_per_texel
+from capture4d.heavy_imports import import_open3d
 from capture4d.types import Mesh
-from capture4d.uv_layout import millimetres_per_texel
-from capture4d.work_folder import load_registration
 from data_synth.config import PRESETS
-from wrinkles.config import PairConfig
-from wrinkles.normal_maps import FramePair, MapTemplate, frame_pairs
+from wrinkles.normal_maps.config import PairConfig
+from wrinkles.normal_maps.template import FramePair, MapTemplate, frame_pairs
 
 TAKES = ("tshirt-200k", "tshirt-cotton-200k")
 RUN = 6

@@ -19,13 +19,13 @@ from torch import nn
 from benchmarks.learning_takes import learned_takes, registered_takes, training_set
 from benchmarks.metric import Metric
 from benchmarks.registered_work import QUICK_TAKE, registered_work
-from capture4d.body import with_shape
+from capture4d.body.skinning import with_shape
+from capture4d.captures.work_folder import load_moving_body, load_records, load_registration
 from capture4d.errors import InputError
-from capture4d.work_folder import load_moving_body, load_records, load_registration
-from retarget.pose_normalisation import PoseRows
-from wrinkles.offset_images import OffsetLayout, OffsetSampler
-from wrinkles.offset_networks import FullyConnected, ImageDecoder, PcaFullyConnected
-from wrinkles.offset_training import (
+from retarget.shapes.pose_normalisation import PoseRows
+from wrinkles.offset_images.layout import OffsetLayout, OffsetSampler
+from wrinkles.offset_images.networks import FullyConnected, ImageDecoder, PcaFullyConnected
+from wrinkles.offset_images.training import (
     OffsetConfig,
     OffsetFrames,
     offset_frames,

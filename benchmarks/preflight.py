@@ -19,16 +19,16 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks import damaged_takes as damage
 from benchmarks.metric import Metric
-from capture4d.app.check import check_take
-from capture4d.app.check_fix import write_fixed
-from capture4d.body_anny import load_anny
-from capture4d.mesh_files import write_mesh
-from capture4d.preflight import Code
-from data_synth import damage
+from benchmarks.plain_takes import COARSE_SCANNER, PlainTake, PlainTakeConfig, plain_take
+from capture4d.body.anny import load_anny
+from capture4d.files.meshes import write_mesh
+from capture4d.preflight.fix import write_fixed
+from capture4d.preflight.stage import check_take
+from capture4d.preflight.verdict import Code
 from data_synth.config import MotionConfig
-from data_synth.plain_takes import COARSE_SCANNER, PlainTake, PlainTakeConfig, plain_take
-from data_synth.scanner_config import RigConfig
+from data_synth.scanner.config import RigConfig
 
 BODY_SCANNER = replace(COARSE_SCANNER, rig=RigConfig(cameras=40, image_size=512))
 SUIT, YELLOW = (150, 152, 156), (255, 196, 0)
@@ -322,7 +322,7 @@ PEAK_SCRIPT = """
 import sys
 from pathlib import Path
 from benchmarks.memory import peak_rss_mb
-from capture4d.app.check import check_take
+from capture4d.preflight.stage import check_take
 check_take(Path(sys.argv[1]), all_frames=True)
 print(peak_rss_mb())
 """

@@ -29,28 +29,21 @@ from scipy.spatial import KDTree
 from benchmarks.memory import peak_rss_mb
 from benchmarks.metric import Metric
 from benchmarks.peers import PEERS, run_peer
-from capture4d.atomic_files import read_json
-from capture4d.evaluation import (
-    border_errors,
-    correspondence_errors,
-    drift_ratio,
-    material_points,
-    surface_distances,
-    truth_distances,
-)
-from capture4d.garment_stage import load_garment_scan
-from capture4d.garment_stage import run as extract
-from capture4d.mesh_files import read_mesh
-from capture4d.scans import (
+from capture4d.captures.capture import (
     Capture,
     read_body,
     read_capture,
     read_poses,
     read_template,
-    read_truth_model,
-    read_truth_vertices,
     write_capture_description,
 )
+from capture4d.captures.garment_scans import load_garment_scan
+from capture4d.captures.truth import read_truth_model, read_truth_vertices
+from capture4d.evaluation import border_errors, correspondence_errors, drift_ratio, material_points, truth_distances
+from capture4d.extraction.stage import run as extract
+from capture4d.files.atomic import read_json
+from capture4d.files.meshes import read_mesh
+from capture4d.geometry.closest_points import surface_distances
 from capture4d.types import Garment, GarmentScan, Mesh
 from registration.config import PAPER, MeshRegistrationConfig, RegistrationConfig
 from registration.register import prepare_frame, register_frame
@@ -129,7 +122,7 @@ def run(
 
 
 def _synthetic_take(quick: bool, workers: int) -> Path:
-    from data_synth.cached_takes import cached_take
+    from benchmarks.cached_takes import cached_take
     from data_synth.config import PRESETS
 
     return cached_take(
@@ -139,7 +132,7 @@ def _synthetic_take(quick: bool, workers: int) -> Path:
 
 def _scanned_diffcloth(output: Path, frames: int, workers: int) -> Path:
     from data_synth.scan_stage import run as scan
-    from data_synth.scanner_config import ScanConfig
+    from data_synth.scanner.config import ScanConfig
 
     meshes = _shared("diffcloth-tshirt/sequence_a.npz")
     scan(meshes, output, ScanConfig(height_m=0.7, frames=frames, step=10, fps=60.0), workers=workers)

@@ -23,16 +23,23 @@ from rich.console import Console
 from benchmarks.learning_takes import Lesson, lesson, training_set
 from benchmarks.metric import Metric
 from retarget.config import FitConfig, LstmConfig, TrainingConfig
-from retarget.controls import ControlLayout
-from retarget.ensemble import ensemble
-from retarget.kernel import fit_kernel
-from retarget.learning import Projected, fitting_clips, learn_shapes, predictions, regression_clips, vertex_error_m
-from retarget.linear import LinearRegressor, fit_linear
-from retarget.mirroring import find_mirror
-from retarget.pose_range import nearest_poses, pose_quaternions
-from retarget.regressors import Clip, FittingClips, Regressor
-from retarget.splits import Piece
-from retarget.training import fit_lstm
+from retarget.regression.controls import ControlLayout
+from retarget.regression.ensemble import ensemble
+from retarget.regression.kernel import fit_kernel
+from retarget.regression.learning import (
+    Projected,
+    fitting_clips,
+    learn_shapes,
+    predictions,
+    regression_clips,
+    vertex_error_m,
+)
+from retarget.regression.linear import LinearRegressor, fit_linear
+from retarget.regression.pose_range import nearest_poses, pose_quaternions
+from retarget.regression.regressors import Clip, FittingClips, Regressor
+from retarget.regression.splits import Piece
+from retarget.regression.training import fit_lstm
+from retarget.shapes.mirroring import find_mirror
 
 FREE_FRAMES = 1000
 DEFAULT = FitConfig()

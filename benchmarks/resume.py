@@ -16,8 +16,8 @@ from pathlib import Path
 from rich.console import Console
 
 from benchmarks.metric import Metric
-from capture4d.atomic_files import read_json
-from capture4d.scans import read_capture
+from capture4d.captures.capture import read_capture
+from capture4d.files.atomic import read_json
 
 STAGES, TRACKED = ("garment", "registration"), ("garment", "body", "registration")
 DELAY_S = 0.5

@@ -15,17 +15,17 @@ from rich.console import Console
 
 from benchmarks.learning_takes import Lesson, lesson, training_set, true_take
 from benchmarks.metric import Metric
-from capture4d.body import ShapedBody
+from capture4d.body.skinning import ShapedBody
+from capture4d.captures.capture import read_capture
 from capture4d.evaluation import correspondence_errors
-from capture4d.scans import read_capture
 from capture4d.types import BlendshapeModel, PoseSequence, RegisteredSequence
 from data_synth.config import TrainingSetConfig
-from retarget.animation import AnimatedFrame, Animator
-from retarget.blendshapes import ShapeSpace, as_model_arrays, project
-from retarget.bodies import retargeted_mean
+from retarget.animation.animator import AnimatedFrame, Animator
+from retarget.animation.bodies import retargeted_mean
+from retarget.animation.intersections import Removed
 from retarget.config import AnimateConfig, RemovalConfig, ShapeConfig
-from retarget.intersections import Removed
-from retarget.learning import learn_shapes
+from retarget.regression.learning import learn_shapes
+from retarget.shapes.blendshapes import ShapeSpace, as_model_arrays, project
 
 METHODS = ("naive", "eq5", "default")
 

@@ -30,30 +30,23 @@ import numpy as np
 
 from benchmarks.metric import Metric
 from benchmarks.rig_peer import calibrate_with_opencv, find_corners_with_opencv
-from capture4d.calibration_board import Board, BoardView, parse_board
-from capture4d.calibration_report import rig_difference, rigid_alignment
-from capture4d.calibration_stage import run as calibrate
-from capture4d.calibration_stage import run_check
-from capture4d.colmap_model import read_model
-from capture4d.corner_detection import detect_corners
-from capture4d.projection import project_world, rotation_from_vector, transform, triangulate
-from capture4d.records import load_rig
-from capture4d.rig_adjustment import RigEstimate
-from capture4d.rig_calibration import Calibration, calibrate_rig
-from capture4d.rig_check import check_rig
-from capture4d.rig_start import usable_views
-from capture4d.rig_uncertainty import centre_sigma_m
+from benchmarks.simulated_views import calibration_rig, measure_corner_errors, simulate_views
+from capture4d.calibration.adjustment import RigEstimate
+from capture4d.calibration.check import check_rig
+from capture4d.calibration.corners import detect_corners
+from capture4d.calibration.report import rig_difference, rigid_alignment
+from capture4d.calibration.rig import Calibration, calibrate_rig
+from capture4d.calibration.stage import run as calibrate
+from capture4d.calibration.stage import run_check
+from capture4d.calibration.start import usable_views
+from capture4d.calibration.uncertainty import centre_sigma_m
+from capture4d.cameras.board import Board, BoardView, parse_board
+from capture4d.cameras.colmap import read_model
+from capture4d.cameras.projection import project_world, rotation_from_vector, transform, triangulate
+from capture4d.files.records import load_rig
 from capture4d.types import Rig
-from data_synth.board_images import photograph_board
-from data_synth.board_views import (
-    CENTRE,
-    VOLUME_M,
-    calibration_rig,
-    measure_corner_errors,
-    simulate_views,
-    visible_corners,
-    wave_board,
-)
+from data_synth.board.images import photograph_board
+from data_synth.board.views import CENTRE, VOLUME_M, visible_corners, wave_board
 
 SPEC = "charuco:14x10:60:44:DICT_5X5_100"
 MOVED_M, MOVED_DEG = 0.5e-3, 0.02

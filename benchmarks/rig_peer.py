@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float64, Int32, UInt8
 
-from capture4d.calibration_board import Board, BoardView
+from capture4d.cameras.board import Board, BoardView
 from capture4d.types import Rig
 
 __all__ = ["calibrate_with_opencv", "find_corners_with_opencv"]

@@ -20,17 +20,17 @@ from rich.console import Console
 
 from benchmarks.metric import Metric
 from capture4d.evaluation import scan_errors
-from capture4d.mesh import vertex_normals
+from capture4d.geometry.mesh import vertex_normals
+from capture4d.runs.workers import run_jobs
 from capture4d.types import Mesh
-from capture4d.workers import run_jobs
-from data_synth.cloth_quality import measure_cloth
+from data_synth.cloth.patterns import locate
+from data_synth.cloth.quality import measure_cloth
+from data_synth.cloth.simulation import dress, simulate
+from data_synth.cloth.wrinkle_relaxation import lift, relax_frame
 from data_synth.config import FABRICS, PRESETS, SynthConfig
-from data_synth.patterns import locate
-from data_synth.scanner import LABEL_BODY, scan_surfaces
-from data_synth.simulation import dress, simulate
+from data_synth.scanner.scan import LABEL_BODY, scan_surfaces
 from data_synth.stage import run as synthesise
 from data_synth.take import Take, prepare_take, simulate_take, take_rig, take_surfaces
-from data_synth.wrinkle_relaxation import lift, relax_frame
 from registration.quality import count_intersecting_faces
 
 OVERHEAD_COSINE = 0.5

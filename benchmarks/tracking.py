@@ -35,19 +35,20 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.dressed_body import covered_vertices, dress_body, sample_scan
 from benchmarks.metric import Metric
-from capture4d.atomic_files import read_json
-from capture4d.body import PosedBody, ShapedBody, pose_frame, with_pose, with_shape
-from capture4d.body_anny import load_anny
-from capture4d.body_sequence import Followed, Tracker
-from capture4d.body_stage import load_tracking
-from capture4d.body_stage import run as track
-from capture4d.body_tracking_config import TrackingConfig
-from capture4d.bvh_format import read_bvh
-from capture4d.garment_stage import run as extract
-from capture4d.motion_files import read_motion, write_motion
-from capture4d.motion_retarget import retarget
-from capture4d.records import ArrayFile, load_poses, save_body
-from capture4d.scans import Capture, read_capture, read_scan, save_poses, write_capture_description, write_scan
+from capture4d.body.anny import load_anny
+from capture4d.body.bvh import read_bvh
+from capture4d.body.motion_files import read_motion, write_motion
+from capture4d.body.motion_retarget import retarget
+from capture4d.body.skinning import PosedBody, ShapedBody, pose_frame, with_pose, with_shape
+from capture4d.captures.capture import Capture, read_capture, read_scan, write_capture_description, write_scan
+from capture4d.captures.work_folder import load_tracking
+from capture4d.extraction.stage import run as extract
+from capture4d.files.arrays import ArrayFile
+from capture4d.files.atomic import read_json
+from capture4d.files.records import load_poses, save_body, save_poses
+from capture4d.tracking.config import TrackingConfig
+from capture4d.tracking.sequence import Followed, Tracker
+from capture4d.tracking.stage import run as track
 from capture4d.types import Body, PoseSequence
 
 MOCAP = Path(__file__).resolve().parents[2] / "shared" / "data" / "mocap" / "cmu_131_03_start_hop_stop.bvh"
@@ -263,9 +264,9 @@ def _farthest_mm(here: np.ndarray, there: np.ndarray) -> float:
 
 def _scanner(body: Body, frames: int, scratch: Path, mocap: Path, seed: int) -> list[Metric]:
     """A capture of the shell, seen by cameras all round and tracked from its files."""
-    from data_synth.rig import capture_rig
-    from data_synth.scanner import LABEL_BODY, LABEL_GARMENT, Surface, scan_surfaces
-    from data_synth.scanner_config import ScannerConfig
+    from data_synth.scanner.config import ScannerConfig
+    from data_synth.scanner.rig import capture_rig
+    from data_synth.scanner.scan import LABEL_BODY, LABEL_GARMENT, Surface, scan_surfaces
 
     person = with_shape(body, np.array(SHAPES[1], np.float32))
     _, truth = list(_motions(body, 4 * frames, mocap))[1]
@@ -329,7 +330,7 @@ def _sequence_errors_mm(body: Body, found: PoseSequence, true: PoseSequence) -> 
 
 
 def _simulated(quick: bool) -> Path:
-    from data_synth.cached_takes import cached_take
+    from benchmarks.cached_takes import cached_take
     from data_synth.config import PRESETS
 
     return cached_take(replace(PRESETS["tiny"], frames=12, capture_every=1) if quick else PRESETS["demo"])

@@ -36,18 +36,18 @@ from rich.table import Table
 from benchmarks.learning_takes import learned_takes, registered_takes, training_set
 from benchmarks.metric import Metric
 from benchmarks.renewal import renew
-from capture4d.body import with_shape
+from capture4d.body.skinning import with_shape
+from capture4d.captures.work_folder import load_moving_body, load_registration
 from capture4d.errors import InputError
-from capture4d.records import save_body, save_poses
-from capture4d.work_folder import load_moving_body, load_registration
-from retarget.animate_stage import run as animate
-from retarget.blendshapes import project, shape_space
-from retarget.bodies import captured_person
+from capture4d.files.records import save_body, save_poses
+from retarget.animation.bodies import captured_person
+from retarget.animation.stage import run as animate
 from retarget.config import AnimateConfig, FitConfig, RemovalConfig, ShapeConfig, SplitConfig
-from retarget.pose_normalisation import PoseRows, unpose_sequence
-from retarget.stage import load_garment_model
-from retarget.stage import run as fit
-from wrinkles.config import (
+from retarget.fit_stage import run as fit
+from retarget.garment_model import load_garment_model
+from retarget.shapes.blendshapes import project, shape_space
+from retarget.shapes.pose_normalisation import PoseRows, unpose_sequence
+from wrinkles.normal_maps.config import (
     PRESETS,
     LossConfig,
     MapConfig,
@@ -57,15 +57,15 @@ from wrinkles.config import (
     TemporalLoss,
     WrinkleConfig,
 )
-from wrinkles.inference import WrinkleModel, load_model
-from wrinkles.map_metrics import MapScores
-from wrinkles.networks import UNet
-from wrinkles.pair_files import load_pairs, pair_template
-from wrinkles.pair_stage import ensure_pairs
-from wrinkles.pair_stage import run as make_pairs
-from wrinkles.pairs import fitted
-from wrinkles.train_stage import run as train_network
-from wrinkles.train_stage import score_take
+from wrinkles.normal_maps.inference import WrinkleModel, load_model
+from wrinkles.normal_maps.metrics import MapScores
+from wrinkles.normal_maps.networks import UNet
+from wrinkles.normal_maps.pair_files import load_pairs, pair_template
+from wrinkles.normal_maps.pair_stage import ensure_pairs
+from wrinkles.normal_maps.pair_stage import run as make_pairs
+from wrinkles.normal_maps.pairs import fitted
+from wrinkles.normal_maps.train_stage import run as train_network
+from wrinkles.normal_maps.train_stage import score_take
 
 PRINTED: dict[str, tuple[float, float]] = {
     "l1": (4.63, 5.11),

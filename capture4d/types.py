@@ -146,7 +146,7 @@ class Body:
     """A skinned parametric body in its rest pose.
 
     `template + shape_directions @ shape` are the rest vertices, `joints + joint_directions @ shape` the rest joints.
-    Functions in `capture4d.body` shape, pose and skin it.
+    Functions in `capture4d.body.skinning` shape, pose and skin it.
     """
 
     template: Mesh

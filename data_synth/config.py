@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from data_synth.outfits import OutfitName
-from data_synth.scanner_config import FusionConfig, RigConfig, ScannerConfig, StereoConfig
+from data_synth.scanner.config import FusionConfig, RigConfig, ScannerConfig, StereoConfig
 
 ClipName = Literal[
     "range-of-motion", "twist", "reach", "side-bend", "walk", "hop", "arm-circles", "reach-twist", "sampled"

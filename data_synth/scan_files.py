@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from capture4d.workdir import Stage
+from capture4d.runs.stage import Stage
 
 __all__ = ["is_whole_scan", "pending_scans"]
 
@@ -24,7 +24,7 @@ def pending_scans(stage: Stage, frame_ids: Iterable[int]) -> list[int]:
 
 
 def is_whole_scan(path: Path) -> bool:
-    """Whether a file is as long as its header says, and its header one of `capture4d.scans.write_scan`."""
+    """Whether a file is as long as its header says, and its header one of `capture4d.captures.capture.write_scan`."""
     try:
         with path.open("rb") as file:
             header = _HEADER.match(file.read(1024))

@@ -14,34 +14,25 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 
-from capture4d.atomic_files import file_digest
+from capture4d.captures.capture import Capture, write_capture_description, write_scan
+from capture4d.captures.truth import TruthFrame, TruthModel, write_truth_frame, write_truth_model
+from capture4d.colours.spaces import parse_colour
 from capture4d.errors import InputError
-from capture4d.evaluation import closest_points
-from capture4d.mesh import boundary_loops
-from capture4d.mesh_files import read_mesh
-from capture4d.open3d_loading import import_open3d
-from capture4d.scans import (
-    Capture,
-    TruthFrame,
-    TruthModel,
-    load_rig,
-    parse_colour,
-    save_garment,
-    save_rig,
-    write_capture_description,
-    write_scan,
-    write_truth_frame,
-    write_truth_model,
-)
+from capture4d.files.atomic import file_digest
+from capture4d.files.meshes import read_mesh
+from capture4d.files.records import load_rig, save_garment, save_rig
+from capture4d.geometry.closest_points import closest_points
+from capture4d.geometry.mesh import boundary_loops
+from capture4d.heavy_imports import import_open3d
+from capture4d.runs.stage import Stage, open_stage
+from capture4d.runs.workers import run_jobs
 from capture4d.types import Garment, Mesh
-from capture4d.workdir import Stage, open_stage
-from capture4d.workers import run_jobs
-from data_synth.border_paint import PaintedSheet, paint_borders
 from data_synth.mesh_sequence import MeshSequence, open_sequence
-from data_synth.rig import bounding_sphere, scanner_rig
 from data_synth.scan_files import pending_scans
-from data_synth.scanner import LABEL_GARMENT, Surface, scan_surfaces
-from data_synth.scanner_config import ScanConfig
+from data_synth.scanner.border_paint import PaintedSheet, paint_borders
+from data_synth.scanner.config import ScanConfig
+from data_synth.scanner.rig import bounding_sphere, scanner_rig
+from data_synth.scanner.scan import LABEL_GARMENT, Surface, scan_surfaces
 from data_synth.setting_checks import check_scan
 
 __all__ = ["run"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from capture4d.errors import InputError
 from data_synth.config import SynthConfig
-from data_synth.scanner_config import ScanConfig, ScannerConfig
+from data_synth.scanner.config import ScanConfig, ScannerConfig
 
 __all__ = ["check_scan", "check_synth"]
 

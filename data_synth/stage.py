@@ -9,30 +9,23 @@ from pathlib import Path
 
 import numpy as np
 
-from capture4d.atomic_files import file_digest, write_json, write_npz
+from capture4d.captures.capture import Capture, write_capture_description, write_scan
+from capture4d.captures.truth import TruthFrame, TruthModel, write_truth_frame, write_truth_model
 from capture4d.errors import InputError
-from capture4d.records import load_rig, save_body, save_garment, save_poses, save_rig
-from capture4d.scans import (
-    Capture,
-    TruthFrame,
-    TruthModel,
-    write_capture_description,
-    write_scan,
-    write_truth_frame,
-    write_truth_model,
-)
+from capture4d.files.atomic import file_digest, write_json, write_npz
+from capture4d.files.records import load_rig, save_body, save_garment, save_poses, save_rig
+from capture4d.runs.stage import Stage, open_stage
+from capture4d.runs.workers import run_jobs
 from capture4d.types import Mesh, Rig
-from capture4d.workdir import Stage, open_stage
-from capture4d.workers import run_jobs
-from data_synth.cloth_quality import measure_cloth
+from data_synth.cloth.patterns import locate
+from data_synth.cloth.quality import measure_cloth
+from data_synth.cloth.template import bind_template, carry
 from data_synth.config import SynthConfig
 from data_synth.outfits import OUTFITS
-from data_synth.patterns import locate
 from data_synth.scan_files import pending_scans
-from data_synth.scanner import scan_surfaces
+from data_synth.scanner.scan import scan_surfaces
 from data_synth.setting_checks import check_synth
 from data_synth.take import Take, measured_poses, prepare_take, simulate_take, take_rig, take_surfaces
-from data_synth.template import bind_template, carry
 
 __all__ = [
     "finish_take",

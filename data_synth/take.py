@@ -12,18 +12,18 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from capture4d.body import PosedBody, ShapedBody, pose_frame, with_shape
-from capture4d.body_anny import load_anny
-from capture4d.motion_retarget import pose_sequence
+from capture4d.body.anny import load_anny
+from capture4d.body.motion_retarget import pose_sequence
+from capture4d.body.skinning import PosedBody, ShapedBody, pose_frame, with_shape
 from capture4d.types import Mesh, PoseSequence, Rig
+from data_synth.cloth.patterns import PanelMesh, Pattern, grade, mesh_pattern, tshirt_pattern
+from data_synth.cloth.simulation import approach_poses, dress, simulate
+from data_synth.cloth.wrinkle_relaxation import WrinkleMesh, relax_frame, wrinkle_mesh
 from data_synth.config import FABRICS, SynthConfig
 from data_synth.motions import make_motion
 from data_synth.outfits import OUTFITS, Outfit
-from data_synth.patterns import PanelMesh, Pattern, grade, mesh_pattern, tshirt_pattern
-from data_synth.rig import bounding_sphere, scanner_rig
-from data_synth.scanner import LABEL_BODY, LABEL_GARMENT, Surface
-from data_synth.simulation import approach_poses, dress, simulate
-from data_synth.wrinkle_relaxation import WrinkleMesh, relax_frame, wrinkle_mesh
+from data_synth.scanner.rig import bounding_sphere, scanner_rig
+from data_synth.scanner.scan import LABEL_BODY, LABEL_GARMENT, Surface
 
 __all__ = [
     "Take",

@@ -14,9 +14,9 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from capture4d.atomic_files import write_bytes, write_json
-from capture4d.workdir import Stage, open_stage
-from capture4d.workers import run_jobs
+from capture4d.files.atomic import write_bytes, write_json
+from capture4d.runs.stage import Stage, open_stage
+from capture4d.runs.workers import run_jobs
 from data_synth.config import SynthConfig, TrainingSetConfig
 from data_synth.setting_checks import check_synth
 from data_synth.stage import (

@@ -12,13 +12,13 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from capture4d.body import skin, with_pose
-from capture4d.mesh_files import write_mesh
-from capture4d.records import load_poses
-from retarget.blendshapes import reconstruct
-from retarget.bodies import captured_person
-from retarget.controls import ControlStream
-from retarget.stage import load_garment_model
+from capture4d.body.skinning import skin, with_pose
+from capture4d.files.meshes import write_mesh
+from capture4d.files.records import load_poses
+from retarget.animation.bodies import captured_person
+from retarget.garment_model import load_garment_model
+from retarget.regression.controls import ControlStream
+from retarget.shapes.blendshapes import reconstruct
 
 
 def main() -> None:

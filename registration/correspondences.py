@@ -14,7 +14,7 @@ from jaxtyping import Float, Float64, Integer
 from scipy import sparse
 from scipy.spatial import KDTree
 
-from capture4d.mesh_kernels import laplacian_pass, mean_edge_length, open_vertices, vertex_normals_kernel
+from capture4d.geometry.mesh_kernels import laplacian_pass, mean_edge_length, open_vertices, vertex_normals_kernel
 from registration.point_grid import PointGrid
 
 __all__ = ["Matches", "ScanSurface", "match", "match_both_ways", "mesh_normals", "prepare_scan"]
@@ -73,7 +73,7 @@ def prepare_scan(
 def mesh_normals(
     vertices: Float64[np.ndarray, "verts 3"], faces: Integer[np.ndarray, "faces 3"]
 ) -> Float64[np.ndarray, "verts 3"]:
-    """Area-weighted unit vertex normals in float64: `capture4d.mesh.vertex_normals` at a tenth of the time."""
+    """Area-weighted unit vertex normals in float64: `capture4d.geometry.mesh.vertex_normals` at a tenth of the time."""
     return vertex_normals_kernel(np.ascontiguousarray(vertices, np.float64), faces)
 
 

@@ -18,7 +18,7 @@ from jaxtyping import Float64, Int32, Integer
 from scipy import sparse
 from scipy.sparse import csgraph
 
-from capture4d.mesh import connected_components, unique_edges
+from capture4d.geometry.mesh import connected_components, unique_edges
 from registration.solver import Rows
 
 __all__ = ["DeformationGraph", "build_graph", "identity_nodes", "node_edge_rows", "rows_of_vertices", "smooth_rows"]

@@ -38,7 +38,7 @@ def edge_faces(
     """The faces on both sides of each edge; on the border the one face twice.
 
     Args:
-        edges: unique and in ascending order, as `capture4d.mesh.unique_edges` returns them.
+        edges: unique and in ascending order, as `capture4d.geometry.mesh.unique_edges` returns them.
     """
     count = int(faces.max()) + 1
     sides = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).astype(np.int64), axis=1)

@@ -8,19 +8,18 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from capture4d.atomic_files import write_json
+from capture4d.colours.spaces import parse_colour
 from capture4d.errors import InputError
-from capture4d.garment_extraction import painted_border
-from capture4d.mesh import boundary_loops, submesh
-from capture4d.mesh_files import MESH_SUFFIXES, read_mesh, write_mesh
-from capture4d.scans import parse_colour
+from capture4d.files.atomic import write_json
+from capture4d.files.meshes import MESH_SUFFIXES, read_mesh, write_mesh
+from capture4d.geometry.mesh import boundary_loops, submesh
 from capture4d.types import Garment, GarmentScan, Mesh
 from registration.alignment import Similarity, align
 from registration.config import MeshRegistrationConfig
@@ -28,7 +27,10 @@ from registration.quality import FrameQuality, assess
 from registration.register import prepare_frame, register_frame
 from registration.template import analyse_template
 
-__all__ = ["MeshRegistration", "register_mesh", "run"]
+__all__ = ["FindBorder", "MeshRegistration", "register_mesh", "run"]
+
+FindBorder = Callable[..., np.ndarray]
+"""Mesh, colours, paint in; points on the painted border out. `capture4d.extraction.garment.painted_border` is one."""
 
 DIAGONAL = 1.2
 """Diagonal of the template's bounding box while it is registered, metres: a shirt's."""
@@ -49,7 +51,14 @@ class MeshRegistration:
     """Judged on the normalised problem; all its lengths, those in `reasons` too, are of the files' world."""
 
 
-def run(template_path: Path, scan_path: Path, output_path: Path, config: MeshRegistrationConfig) -> MeshRegistration:
+def run(
+    template_path: Path,
+    scan_path: Path,
+    output_path: Path,
+    config: MeshRegistrationConfig,
+    *,
+    find_border: FindBorder | None = None,
+) -> MeshRegistration:
     """Register one mesh file to another; writes the result, and its measures as JSON beside it.
 
     Args:
@@ -69,6 +78,7 @@ def run(template_path: Path, scan_path: Path, output_path: Path, config: MeshReg
         scan_file.mesh,
         colours=scan_file.colours,
         config=config,
+        find_border=find_border,
         template_name=str(template_path),
         scan_name=str(scan_path),
     )
@@ -97,6 +107,7 @@ def register_mesh(
     *,
     colours: np.ndarray | None = None,
     config: MeshRegistrationConfig,
+    find_border: FindBorder | None = None,
     template_name: str = "template",
     scan_name: str = "scan",
 ) -> MeshRegistration:
@@ -114,7 +125,7 @@ def register_mesh(
         return scale * (points.astype(np.float64) - origin)
 
     start = normalised(template.vertices)
-    garment_scan = _garment_scan(scan, normalised(scan.vertices), colours, config, scan_name)
+    garment_scan = _garment_scan(scan, normalised(scan.vertices), colours, find_border, config, scan_name)
     if config.align != "none":
         motion: Similarity = align(
             start, garment_scan.mesh.vertices.astype(np.float64), with_scale=config.align == "similarity"
@@ -158,7 +169,12 @@ def _require_one_unit(template: float, scan: float, template_name: str, scan_nam
 
 
 def _garment_scan(
-    scan: Mesh, vertices: np.ndarray, colours: np.ndarray | None, config: MeshRegistrationConfig, name: str
+    scan: Mesh,
+    vertices: np.ndarray,
+    colours: np.ndarray | None,
+    find_border: FindBorder | None,
+    config: MeshRegistrationConfig,
+    name: str,
 ) -> GarmentScan:
     """The whole scan, with the border points that its paint shows."""
     mesh = Mesh(vertices.astype(np.float32), scan.faces)
@@ -167,5 +183,6 @@ def _garment_scan(
         return GarmentScan(submesh(mesh, np.ones(len(mesh.faces), bool))[0], none, np.zeros(0, np.int32), (), 0)
     if colours is None:
         raise InputError(f"{name}: expected a colour per vertex for --boundary-colour, found none")
-    points = painted_border(mesh, colours, parse_colour(config.boundary_colour), source=name)
+    assert find_border is not None, "a painted border needs somebody who finds it"
+    points = find_border(mesh, colours, parse_colour(config.boundary_colour), source=name)
     return GarmentScan(mesh, points, np.full(len(points), -1, np.int32), (), 0)

@@ -28,7 +28,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from capture4d.body import ShapedBody, pose_frame, skin, unskin, with_shape
+from capture4d.body.skinning import ShapedBody, pose_frame, skin, unskin, with_shape
 from capture4d.errors import InputError
 from capture4d.types import Body, GarmentScan, PoseSequence
 from registration.config import RegistrationConfig, SequenceConfig

@@ -19,24 +19,30 @@ from pathlib import Path
 
 import numpy as np
 
-from capture4d.atomic_files import read_json, write_bytes, write_json, write_npz
-from capture4d.body_stage import load_tracking, tracking_digest
-from capture4d.errors import InputError
-from capture4d.garment_binding import with_body_shape
-from capture4d.garment_stage import load_garment_scan
-from capture4d.scans import (
+from capture4d.body.binding import with_body_shape
+from capture4d.captures.capture import (
     Capture,
     capture_digest,
     motion_digest,
     read_capture,
     read_template,
-    save_garment,
     template_digest,
 )
+from capture4d.captures.garment_scans import load_garment_scan
+from capture4d.captures.work_folder import (
+    REGISTER,
+    VERDICTS,
+    captured_motion,
+    load_tracking,
+    stack_vertices,
+    tracking_digest,
+)
+from capture4d.errors import InputError
+from capture4d.files.atomic import read_json, write_bytes, write_json, write_npz
+from capture4d.files.records import save_garment
+from capture4d.runs.stage import Stage, open_stage, require_complete
+from capture4d.runs.workers import run_jobs
 from capture4d.types import Body, Garment, PoseSequence
-from capture4d.work_folder import REGISTER, VERDICTS, captured_motion, stack_vertices
-from capture4d.workdir import Stage, open_stage, require_complete
-from capture4d.workers import run_jobs
 from registration.config import RegistrationConfig
 from registration.sequence import FrameResult, Mover, register_run, segments
 from registration.template import TemplateAnalysis, analyse_template

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64, Int32
 
 from capture4d.errors import InputError
-from capture4d.mesh import unique_edges
+from capture4d.geometry.mesh import unique_edges
 from capture4d.types import Garment, Mesh
 from registration.config import RegistrationConfig
 from registration.deformation_graph import DeformationGraph, build_graph

@@ -16,16 +16,16 @@ from typing import Any, NoReturn
 
 import tyro
 
-from capture4d.app.capture_commands import Calibrate, Check, CheckRig
-from capture4d.app.file_commands import ConvertBody, ConvertPoses, ConvertRig, RegisterMesh, Template
-from capture4d.app.model_commands import Animate, Fit
-from capture4d.app.stage_commands import Extract, Register, Report, Run, Track
-from capture4d.app.synthesis_commands import Demo, Scan, Synth, SynthBoard
-from capture4d.app.wrinkle_commands import Compare, WrinklesApply, WrinklesMaps, WrinklesTrain
+from capture4d.app.commands.capture import Calibrate, Check, CheckRig
+from capture4d.app.commands.files import ConvertBody, ConvertPoses, ConvertRig, RegisterMesh, Template
+from capture4d.app.commands.models import Animate, Fit
+from capture4d.app.commands.stages import Extract, Register, Report, Run, Track
+from capture4d.app.commands.synthesis import Demo, Scan, Synth, SynthBoard
+from capture4d.app.commands.wrinkles import Compare, WrinklesApply, WrinklesMaps, WrinklesTrain
 from capture4d.errors import InputError
 from data_synth import config as synth_config
 from registration import config as registration_config
-from wrinkles import config as wrinkle_config
+from wrinkles.normal_maps import config as wrinkle_config
 
 __all__ = ["main"]
 
@@ -101,7 +101,7 @@ def _run(arguments: list[str]) -> int:
         kept = "; finished frames are kept, the same command goes on" if error.errno == errno.ENOSPC else ""
         return _complain(f"{error.filename or 'output'}: {error.strerror}{kept}")
     except RuntimeError as error:
-        from capture4d.workers import WorkerDied
+        from capture4d.runs.workers import WorkerDied
 
         if not isinstance(error, WorkerDied):
             raise

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from capture4d.atomic_files import read_json
-from capture4d.body_tracking_config import TrackingConfig
 from capture4d.errors import InputError
+from capture4d.files.atomic import read_json
+from capture4d.tracking.config import TrackingConfig
 from registration.config import RegistrationConfig
 from retarget.config import AnimateConfig, FitConfig, TrainingConfig
 
@@ -29,14 +29,14 @@ def run_demo(output: Path, *, workers: int, overwrite: bool = False) -> tuple[Pa
     """Synthesise `output`/capture, calibrate its rig from photographs of a board, run everything on the scans, the true
     poses left aside, learn the garment and its wrinkles, compare what was learned, and put the garment on another body;
     the paths of the two reports."""
-    from capture4d.app.compare import run as compare
-    from capture4d.app.compare_config import CompareConfig
+    from capture4d.app.compare.config import CompareConfig
+    from capture4d.app.compare.page import run as compare
     from data_synth.config import PRESETS
     from data_synth.stage import run as synthesise
-    from retarget.animate_stage import run as animate
-    from retarget.stage import run as fit
-    from wrinkles.config import PRESETS as WRINKLES
-    from wrinkles.train_stage import run as train_wrinkles
+    from retarget.animation.stage import run as animate
+    from retarget.fit_stage import run as fit
+    from wrinkles.normal_maps.config import PRESETS as WRINKLES
+    from wrinkles.normal_maps.train_stage import run as train_wrinkles
 
     synthesise(output / "capture", PRESETS["demo"], workers=workers, overwrite=overwrite)
     _calibrate_demo(output / "capture" / "rig.json", output / "rig", workers=workers, overwrite=overwrite)
@@ -63,9 +63,9 @@ def run_demo(output: Path, *, workers: int, overwrite: bool = False) -> tuple[Pa
 
 def _calibrate_demo(truth: Path, folder: Path, *, workers: int, overwrite: bool) -> None:
     """Photograph a board with the true rig, and calibrate from the photographs alone."""
-    from capture4d.app.calibration_page import write_page
-    from capture4d.calibration_stage import run as calibrate
-    from data_synth.board_stage import run as photograph
+    from capture4d.app.report.calibration import write_page
+    from capture4d.calibration.stage import run as calibrate
+    from data_synth.board.stage import run as photograph
     from data_synth.config import BoardConfig
 
     config = BoardConfig(poses=BOARD_POSES)
@@ -105,8 +105,8 @@ def run_stages(
     overwrite: bool = False,
 ) -> None:
     """The same without the report."""
-    from capture4d.garment_stage import run as extract
-    from capture4d.scans import read_capture, read_poses, read_template
+    from capture4d.captures.capture import read_capture, read_poses, read_template
+    from capture4d.extraction.stage import run as extract
     from registration.stage import run as register
 
     description = read_capture(capture)
@@ -116,7 +116,7 @@ def run_stages(
     extract(capture, output / "garment", workers=workers, overwrite=overwrite)
     body_folder = None
     if track or needs_tracking(capture):
-        from capture4d.body_stage import run as track_body
+        from capture4d.tracking.stage import run as track_body
 
         body_folder = output / "body"
         track_body(capture, body_folder, tracking or TrackingConfig(), workers=workers, overwrite=overwrite)
@@ -133,7 +133,7 @@ def run_stages(
 
 def needs_tracking(capture: Path) -> bool:
     """Whether the template is bound to a body of which the capture has no poses."""
-    from capture4d.scans import read_capture, read_template
+    from capture4d.captures.capture import read_capture, read_template
 
     description = read_capture(capture)
     return not (capture / "poses.npz").is_file() and read_template(description).skin_weights is not None
@@ -141,13 +141,13 @@ def needs_tracking(capture: Path) -> bool:
 
 def run_report(work: Path, *, capture: Path | None = None, workers: int = 1, overwrite: bool = False) -> Path:
     """Draw the report of a work folder; the path of its page."""
-    from capture4d.work_folder import is_animated
+    from capture4d.captures.work_folder import is_animated
 
     if is_animated(work):
-        from capture4d.app.animation_report import run as report_animation
+        from capture4d.app.report.animation import run as report_animation
 
         return report_animation(work, workers=workers, overwrite=overwrite)
-    from capture4d.app.report import run as report
+    from capture4d.app.report.take import run as report
 
     return report(work, capture=capture, workers=workers, overwrite=overwrite)
 

@@ -5,7 +5,7 @@ import pytest
 
 from benchmarks.renewal import renew
 from capture4d.errors import InputError
-from capture4d.workdir import open_stage, require_complete
+from capture4d.runs.stage import open_stage, require_complete
 
 
 def make(folder: Path, settings: dict[str, int], *, stage: str = "test", overwrite: bool = False) -> str:

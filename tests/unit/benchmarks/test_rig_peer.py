@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from benchmarks.rig_peer import calibrate_with_opencv, find_corners_with_opencv
-from capture4d.calibration_board import BoardView, parse_board
-from capture4d.calibration_report import rig_difference
-from capture4d.rig_adjustment import RigEstimate
+from benchmarks.simulated_views import calibration_rig, simulate_views
+from capture4d.calibration.adjustment import RigEstimate
+from capture4d.calibration.report import rig_difference
+from capture4d.cameras.board import BoardView, parse_board
 from capture4d.types import Rig
-from data_synth.board_views import calibration_rig, simulate_views, wave_board
+from data_synth.board.views import wave_board
 
 BOARD = parse_board("charuco:14x10:60:44:DICT_5X5_100")
 ARC_DEG = 110.0

@@ -26,18 +26,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.simulated_views import calibration_rig, simulate_views
 from capture4d.app.cli import main
-from capture4d.atomic_files import write_bytes, write_npz
-from capture4d.body import with_shape
-from capture4d.body_anny import load_anny
-from capture4d.body_regions import body_region
-from capture4d.calibration_board import parse_board
-from capture4d.calibration_stage import DETECTOR
-from capture4d.mesh_files import write_mesh
-from capture4d.motion_retarget import SMPL_TREE
-from capture4d.records import save_body, save_poses, save_rig
+from capture4d.body.anny import load_anny
+from capture4d.body.motion_retarget import SMPL_TREE
+from capture4d.body.skinning import with_shape
+from capture4d.calibration.stage import DETECTOR
+from capture4d.cameras.board import parse_board
+from capture4d.files.atomic import write_bytes, write_npz
+from capture4d.files.meshes import write_mesh
+from capture4d.files.records import save_body, save_poses, save_rig
+from capture4d.templates.body_regions import body_region
 from capture4d.types import Mesh, PoseSequence
-from data_synth.board_views import calibration_rig, simulate_views, wave_board
+from data_synth.board.views import wave_board
 
 BOARD = "charuco:10x8:80:60:DICT_5X5_100"
 

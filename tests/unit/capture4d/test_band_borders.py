@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from capture4d.band_borders import border_beyond_rim
+from capture4d.extraction.band_borders import border_beyond_rim
 from capture4d.types import Mesh
 
 STEP, WIDTH, LENGTH, CLOTH, BODY = 0.0022, 0.012, 0.3, 0.06, 0.02

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture4d.blendshape_files import load_blendshapes, save_blendshapes
 from capture4d.errors import InputError
-from capture4d.tensor_files import read_tensors, write_tensors
+from capture4d.files.tensors import read_tensors, write_tensors
 from capture4d.types import BlendshapeModel, Garment, Mesh
+from retarget.shapes.files import load_blendshapes, save_blendshapes
 
 
 def some_model(*, uv: bool = True) -> BlendshapeModel:

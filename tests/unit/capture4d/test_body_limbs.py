@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from capture4d.body_anny import load_anny
-from capture4d.body_limbs import guessed_limbs, unseen_limbs
-from capture4d.motion_retarget import SMPL_TREE
+from capture4d.body.anny import load_anny
+from capture4d.body.motion_retarget import SMPL_TREE
+from capture4d.tracking.limbs import guessed_limbs, unseen_limbs
 
 SKELETONS = (load_anny().joint_names, tuple(SMPL_TREE))
 

@@ -11,19 +11,20 @@ import pytest
 from scipy.spatial import KDTree
 
 from benchmarks.dressed_body import dress_body
-from capture4d import body_stage
-from capture4d.atomic_files import read_json
-from capture4d.body import pose_frame, with_shape
-from capture4d.body_anny import load_anny
-from capture4d.body_sequence import Followed, Quality
-from capture4d.body_stage import load_tracking, run, tracking_digest
-from capture4d.body_tracking_config import TrackingConfig
-from capture4d.body_tracking_jacobian import BodyState
+from capture4d.body.anny import load_anny
+from capture4d.body.motion_retarget import pose_sequence
+from capture4d.body.posed_surface import BodyState
+from capture4d.body.skinning import pose_frame, with_shape
+from capture4d.captures.capture import Capture, write_capture_description, write_scan
+from capture4d.captures.work_folder import load_tracking, tracking_digest
 from capture4d.errors import InputError
-from capture4d.mesh import submesh
-from capture4d.motion_retarget import pose_sequence
-from capture4d.records import save_body, save_poses
-from capture4d.scans import Capture, write_capture_description, write_scan
+from capture4d.files.atomic import read_json
+from capture4d.files.records import save_body, save_poses
+from capture4d.geometry.mesh import submesh
+from capture4d.tracking import stage as body_stage
+from capture4d.tracking.config import TrackingConfig
+from capture4d.tracking.sequence import Followed, Quality
+from capture4d.tracking.stage import run
 from capture4d.types import Mesh, PoseSequence, Scan
 
 CLOTH, SUIT = (47, 98, 201), (150, 152, 156)

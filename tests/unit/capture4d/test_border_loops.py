@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from capture4d.border_loops import SHIRT, loop_order, name_shirt_loops, separate_loops, straighten
+from capture4d.extraction.border_loops import SHIRT, loop_order, name_shirt_loops, separate_loops, straighten
 
 
 def ring(middle: tuple[float, float, float], axis: tuple[float, float, float], radius: float, count: int) -> np.ndarray:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from capture4d.calibration_board import Board, parse_board
+from capture4d.cameras.board import Board, parse_board
 from capture4d.errors import InputError
 
 SPEC = "charuco:14x10:60:44:DICT_5X5_100"

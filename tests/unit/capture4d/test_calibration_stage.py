@@ -9,17 +9,18 @@ import cv2
 import numpy as np
 import pytest
 
-from capture4d import calibration_stage
+from benchmarks.simulated_views import calibration_rig
 from capture4d.app.cli import main
-from capture4d.calibration_board import parse_board
-from capture4d.calibration_report import rig_difference
-from capture4d.calibration_stage import find_images
+from capture4d.calibration import stage as calibration_stage
+from capture4d.calibration.adjustment import RigEstimate
+from capture4d.calibration.report import rig_difference
+from capture4d.calibration.stage import find_images
+from capture4d.cameras.board import parse_board
+from capture4d.cameras.projection import rotation_from_vector
 from capture4d.errors import InputError
-from capture4d.projection import rotation_from_vector
-from capture4d.records import load_rig, save_rig
-from capture4d.rig_adjustment import RigEstimate
-from data_synth.board_images import photograph_board
-from data_synth.board_views import calibration_rig, visible_corners, wave_board
+from capture4d.files.records import load_rig, save_rig
+from data_synth.board.images import photograph_board
+from data_synth.board.views import visible_corners, wave_board
 
 SPEC = "charuco:9x7:90:68:DICT_4X4_50"
 CAMERAS, POSES = 3, 9
@@ -114,7 +115,7 @@ def test_corners_are_detected_once(shoot, tmp_path: Path, monkeypatch: pytest.Mo
     def never(*_: object) -> None:
         raise AssertionError("detected again")
 
-    monkeypatch.setattr("capture4d.calibration_stage.detect_corners", never)
+    monkeypatch.setattr("capture4d.calibration.stage.detect_corners", never)
     assert run(*calibrate(folder / "images", tmp_path / "rig.json", "--hold-out", "0", "--no-flatness")) == 0
     first, second = (load_rig(path / "rig.json").T_camera_world for path in (folder, tmp_path))
     np.testing.assert_allclose(first, second, atol=1e-7)

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 from capture4d.app.cli import main
-from capture4d.atomic_files import write_bytes, write_json
+from capture4d.captures.garment_scans import load_garment_scan
 from capture4d.errors import InputError
-from capture4d.garment_stage import load_garment_scan
-from capture4d.mesh_files import read_mesh, write_mesh
-from capture4d.ply_format import ply_bytes
-from capture4d.records import load_garment, save_garment, save_poses
+from capture4d.files.atomic import write_bytes, write_json
+from capture4d.files.meshes import read_mesh, write_mesh
+from capture4d.files.ply import ply_bytes
+from capture4d.files.records import load_garment, save_garment, save_poses
 from capture4d.types import Mesh, PoseSequence
 
 
@@ -128,12 +128,12 @@ def test_a_preset_is_what_single_options_start_from(monkeypatch: pytest.MonkeyPa
 def test_what_is_the_users_to_repair_is_one_line(
     error: Exception, code: int, said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    import capture4d.garment_stage
+    import capture4d.extraction.stage
 
     def fail(*_: object, **__: object) -> None:
         raise error
 
-    monkeypatch.setattr(capture4d.garment_stage, "run", fail)
+    monkeypatch.setattr(capture4d.extraction.stage, "run", fail)
     assert run("extract", "capture", "--output", "work") == code
     written = capsys.readouterr().err
     assert written.endswith(said)
@@ -141,12 +141,12 @@ def test_what_is_the_users_to_repair_is_one_line(
 
 
 def test_our_own_bugs_keep_their_traceback(monkeypatch: pytest.MonkeyPatch):
-    import capture4d.garment_stage
+    import capture4d.extraction.stage
 
     def fail(*_: object, **__: object) -> None:
         raise ZeroDivisionError
 
-    monkeypatch.setattr(capture4d.garment_stage, "run", fail)
+    monkeypatch.setattr(capture4d.extraction.stage, "run", fail)
     with pytest.raises(ZeroDivisionError):
         main(["extract", "capture", "--output", "work"])
 

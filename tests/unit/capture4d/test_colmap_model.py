@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture4d.colmap_model import colmap_camera, lens_of, read_model, to_colmap_pixels, write_model
+from benchmarks.simulated_views import calibration_rig
+from capture4d.cameras.colmap import colmap_camera, lens_of, read_model, to_colmap_pixels, write_model
+from capture4d.cameras.projection import project_world
 from capture4d.errors import InputError
-from capture4d.projection import project_world
-from capture4d.pycolmap_loading import import_pycolmap
+from capture4d.heavy_imports import import_pycolmap
 from capture4d.types import Rig
-from data_synth.board_views import calibration_rig
 
 ROOT = Path(__file__).parents[3]
 
@@ -109,7 +109,7 @@ def test_opencv_writes_png_after_pycolmap_has_been_imported(tmp_path: Path):
     """With the imports in the other order the process aborts."""
     script = (
         "import sys, numpy as np\n"
-        "from capture4d.pycolmap_loading import import_pycolmap\n"
+        "from capture4d.heavy_imports import import_pycolmap\n"
         "import_pycolmap()\n"
         "import cv2\n"
         "assert cv2.imwrite(sys.argv[1], np.zeros((64, 64, 3), np.uint8))"

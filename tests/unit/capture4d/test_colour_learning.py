@@ -10,13 +10,15 @@ import cv2
 import numpy as np
 import pytest
 
-from capture4d.body_tracking_config import TrackingConfig
-from capture4d.colour_learning import ColoursNotSeparableError, fit_light, learn_colours
-from capture4d.garment_extraction import encode_colours, extract_garment, linear_colours
-from capture4d.garment_stage import load_garment_scan, run
-from capture4d.mesh import vertex_normals
-from capture4d.mesh_files import read_coloured_mesh
-from capture4d.scans import read_capture, scan_path
+from capture4d.captures.capture import read_capture, scan_path
+from capture4d.captures.garment_scans import load_garment_scan
+from capture4d.colours.learning import ColoursNotSeparableError, fit_light, learn_colours
+from capture4d.colours.spaces import encode_colours, linear_colours
+from capture4d.extraction.garment import extract_garment
+from capture4d.extraction.stage import run
+from capture4d.files.meshes import read_coloured_mesh
+from capture4d.geometry.mesh import vertex_normals
+from capture4d.tracking.config import TrackingConfig
 from capture4d.types import Mesh, Scan
 
 AROUND, ALONG = 140, 160
@@ -212,7 +214,7 @@ def write_textured(path: Path, mesh: Mesh) -> None:
 
 
 def test_tracking_sees_the_same_cloth_without_colours(tube_capture: Path) -> None:
-    from capture4d.body_stage import _points
+    from capture4d.tracking.stage import _points
 
     given, _ = _points(read_capture(tube_capture), 6, TrackingConfig())
     without_colours(tube_capture)

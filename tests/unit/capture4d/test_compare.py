@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from capture4d.app.cli import main
-from capture4d.app.compare_garment import model_take
+from capture4d.app.compare.garment import model_take
+from capture4d.body.binding import bind
+from capture4d.captures.capture import write_scan
+from capture4d.captures.work_folder import load_moving_body, load_registration
 from capture4d.errors import InputError
-from capture4d.garment_binding import bind
-from capture4d.records import save_body, save_poses
-from capture4d.scans import write_scan
+from capture4d.files.records import save_body, save_poses
 from capture4d.types import PoseSequence, Scan
-from capture4d.work_folder import load_moving_body, load_registration
-from retarget.stage import load_garment_model
+from retarget.garment_model import load_garment_model
 from tests.unit.wrinkles.conftest import make_work, outside_the_unit_square, some_garment, some_scan
 from tests.unit.wrinkles.test_offsets import limb, upright
 from tests.unit.wrinkles.test_stages import SMALL

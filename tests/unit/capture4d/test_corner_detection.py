@@ -7,12 +7,13 @@ import cv2
 import numpy as np
 import pytest
 
-from capture4d.calibration_board import Board, parse_board
-from capture4d.corner_detection import detect_corners, find_corners
-from capture4d.projection import project_world, rotation_from_vector, transform
+from benchmarks.simulated_views import calibration_rig, measure_corner_errors
+from capture4d.calibration.corners import detect_corners, find_corners
+from capture4d.cameras.board import Board, parse_board
+from capture4d.cameras.projection import project_world, rotation_from_vector, transform
 from capture4d.types import Rig
-from data_synth.board_images import DEFAULT, BoardImageConfig, photograph_board
-from data_synth.board_views import calibration_rig, measure_corner_errors, visible_corners, wave_board
+from data_synth.board.images import DEFAULT, BoardImageConfig, photograph_board
+from data_synth.board.views import visible_corners, wave_board
 
 SPEC = "charuco:14x10:60:44:DICT_5X5_100"
 

@@ -3,16 +3,15 @@ import pytest
 
 from capture4d.evaluation import (
     border_errors,
-    closest_points,
     correspondence_errors,
     curve_distances,
     drift_per_frame,
     drift_ratio,
     material_points,
     scan_errors,
-    surface_distances,
     truth_distances,
 )
+from capture4d.geometry.closest_points import closest_points, surface_distances
 from capture4d.types import Mesh
 
 

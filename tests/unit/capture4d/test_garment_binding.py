@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from capture4d.body import pose_frame, skin, with_pose, with_shape
-from capture4d.body_anny import load_anny
+from capture4d.body.anny import load_anny
+from capture4d.body.binding import bind, diffuse, with_body_shape
+from capture4d.body.skinning import pose_frame, skin, with_pose, with_shape
 from capture4d.errors import InputError
-from capture4d.garment_binding import bind, diffuse, with_body_shape
-from capture4d.mesh import submesh, vertex_normals
+from capture4d.geometry.mesh import submesh, vertex_normals
 from capture4d.types import Body, Garment, Mesh
 from data_synth.motions import CLIPS, scripted_clip
 

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from capture4d.colours.labels import classify_colours
 from capture4d.errors import InputError
-from capture4d.garment_extraction import ColourNotFoundError, classify_colours, extract_garment
+from capture4d.extraction.garment import ColourNotFoundError, extract_garment
 from capture4d.types import Mesh, Scan
 
 CLOTH, TOP, BOTTOM, SUIT = (47, 98, 201), (255, 196, 0), (229, 51, 42), (150, 152, 156)

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 
 from capture4d.app.cli import main
-from capture4d.body import PosedBody, ShapedBody, pose_frame, with_pose, with_shape
-from capture4d.body_anny import load_anny
-from capture4d.body_regions import REGIONS, body_region
+from capture4d.body.anny import load_anny
+from capture4d.body.skinning import PosedBody, ShapedBody, pose_frame, with_pose, with_shape
 from capture4d.errors import InputError
-from capture4d.garment_template import make_template, weld
-from capture4d.mesh import boundary_loops, unique_edges
-from capture4d.mesh_files import write_mesh
-from capture4d.records import load_garment, save_body, save_poses
-from capture4d.template_stage import run
+from capture4d.files.meshes import write_mesh
+from capture4d.files.records import load_garment, save_body, save_poses
+from capture4d.geometry.mesh import boundary_loops, unique_edges
+from capture4d.geometry.uv_atlas import check_uv, fresh_uv
+from capture4d.templates.body_regions import REGIONS, body_region
+from capture4d.templates.garment import make_template, weld
+from capture4d.templates.stage import run
 from capture4d.types import Mesh
-from capture4d.uv_atlas import check_uv, fresh_uv
 from data_synth.motions import CLIPS, scripted_clip
 
 SHAPE = np.array([0.5, -0.6, 0.3], np.float32)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.special import expit
 
-from capture4d.garment_extraction import classify_colours, settle_labels
-from capture4d.label_edges import sharpen_labels
+from capture4d.colours.labels import classify_colours, settle_labels
+from capture4d.extraction.label_edges import sharpen_labels
 from capture4d.types import Mesh
 
 STEP, WIDTH = 0.0027, 0.012

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from capture4d.mesh import (
+from capture4d.geometry.mesh import (
     boundary_edges,
     boundary_loops,
     connected_components,

@@ -12,17 +12,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from capture4d.app.check_take import time_stamp
 from capture4d.app.cli import main
-from capture4d.atomic_files import write_json
-from capture4d.body import pose_frame, with_shape
-from capture4d.body_anny import load_anny
-from capture4d.mesh_files import read_coloured_mesh, read_mesh, write_mesh
-from capture4d.motion_retarget import pose_sequence
-from capture4d.preflight import ADVICE, CODES, BadFrame, TakeFacts, judge
-from capture4d.records import load_poses, save_body, save_poses
-from capture4d.scan_placement import Placement, find_units, place, place_rig, upright
-from capture4d.scan_statistics import (
+from capture4d.body.anny import load_anny
+from capture4d.body.motion_retarget import pose_sequence
+from capture4d.body.skinning import pose_frame, with_shape
+from capture4d.captures.placement import Placement, place, place_rig
+from capture4d.colours.spaces import to_lab
+from capture4d.files.atomic import write_json
+from capture4d.files.meshes import read_coloured_mesh, read_mesh, write_mesh
+from capture4d.files.records import load_poses, save_body, save_poses
+from capture4d.files.textures import texture_colours
+from capture4d.preflight.statistics import (
     FrameStatistics,
     Paints,
     camera_counts,
@@ -32,9 +32,10 @@ from capture4d.scan_statistics import (
     rig_middle,
     surface_noise,
     surface_shift,
-    to_lab,
 )
-from capture4d.textures import texture_colours
+from capture4d.preflight.survey import find_units, upright
+from capture4d.preflight.take_folder import time_stamp
+from capture4d.preflight.verdict import ADVICE, CODES, BadFrame, TakeFacts, judge
 from capture4d.types import Mesh, Rig, Scan
 
 BLUE, YELLOW, GREY = (47, 98, 201), (255, 196, 0), (150, 152, 156)
@@ -436,7 +437,7 @@ def test_a_killed_fix_is_repeated_and_lies_beside_the_take(
 
     monkeypatch.chdir(take)
     with monkeypatch.context() as patched:
-        patched.setattr("capture4d.app.check_fix._copy_companions", die)
+        patched.setattr("capture4d.preflight.fix._copy_companions", die)
         with pytest.raises(SystemExit) as exit_:
             main(["check", ".", "--fix", "--workers", "1"])
         assert exit_.value.code == 130

@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from capture4d.projection import (
+from benchmarks.simulated_views import calibration_rig
+from capture4d.cameras.projection import (
     lens_jacobian,
     point_jacobian,
     project,
@@ -18,7 +19,6 @@ from capture4d.projection import (
     twist_jacobian,
     undistort,
 )
-from data_synth.board_views import calibration_rig
 
 K = np.array([[1400.0, 0, 700.3], [0, 1410.0, 512.8], [0, 0, 1]])
 D = np.array([-0.12, 0.09, 4e-4, -6e-4, 0.01])

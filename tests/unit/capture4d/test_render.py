@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from capture4d.app.render import Drawn, View, frame_view, heat_colours, render
+from capture4d.app.drawing.render import Drawn, View, frame_view, heat_colours, render
 from capture4d.types import Mesh
 
 RED, GREEN, BLUE = (220, 30, 30), (30, 200, 30), (30, 30, 220)

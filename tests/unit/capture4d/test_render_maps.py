@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from capture4d.app.render import Drawn, View, render
+from capture4d.app.drawing.render import Drawn, View, render
 from capture4d.types import Mesh
 
 SIZE = 128

@@ -6,28 +6,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from capture4d.app.charts import Line, line_chart, nice_ticks
-from capture4d.app.report import ReportConfig, run
-from capture4d.app.report_metrics import summarise
-from capture4d.app.report_pictures import Panel, data_uri, write_panel
-from capture4d.atomic_files import write_bytes, write_json, write_npy, write_npz
-from capture4d.body_anny import load_anny
+from capture4d.app.drawing.charts import Line, line_chart, nice_ticks
+from capture4d.app.drawing.panels import Panel, data_uri, write_panel
+from capture4d.app.report.metrics import summarise
+from capture4d.app.report.take import ReportConfig, run
+from capture4d.body.anny import load_anny
+from capture4d.captures.capture import Capture, write_capture_description, write_scan
+from capture4d.captures.truth import TruthFrame, TruthModel, write_truth_frame, write_truth_model
 from capture4d.errors import InputError
-from capture4d.mesh import boundary_loops
-from capture4d.scans import (
-    Capture,
-    TruthFrame,
-    TruthModel,
-    save_body,
-    save_garment,
-    save_poses,
-    write_capture_description,
-    write_scan,
-    write_truth_frame,
-    write_truth_model,
-)
+from capture4d.files.atomic import write_bytes, write_json, write_npy, write_npz
+from capture4d.files.records import save_body, save_garment, save_poses
+from capture4d.geometry.mesh import boundary_loops
+from capture4d.runs.stage import open_stage
 from capture4d.types import Garment, Mesh, PoseSequence, Scan
-from capture4d.workdir import open_stage
 
 FRAMES = 8
 

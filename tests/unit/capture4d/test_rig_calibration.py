@@ -5,16 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from capture4d.calibration_board import Board, BoardView, parse_board
-from capture4d.calibration_config import CalibrationConfig
-from capture4d.calibration_report import calibration_report, coverage_grid, rig_difference, rigid_alignment
+from benchmarks.simulated_views import calibration_rig, simulate_views
+from capture4d.calibration.adjustment import RigEstimate, adjust_rig, view_residuals
+from capture4d.calibration.config import CalibrationConfig
+from capture4d.calibration.report import calibration_report, coverage_grid, rig_difference, rigid_alignment
+from capture4d.calibration.rig import Calibration, calibrate_rig
+from capture4d.calibration.uncertainty import centre_sigma_m, fit_board, noise_of, robust_scale
+from capture4d.cameras.board import Board, BoardView, parse_board
+from capture4d.cameras.projection import rotation_from_vector, transform
 from capture4d.errors import InputError
-from capture4d.projection import rotation_from_vector, transform
-from capture4d.rig_adjustment import RigEstimate, adjust_rig, view_residuals
-from capture4d.rig_calibration import Calibration, calibrate_rig
-from capture4d.rig_uncertainty import centre_sigma_m, fit_board, noise_of, robust_scale
 from capture4d.types import Rig
-from data_synth.board_views import calibration_rig, simulate_views, wave_board
+from data_synth.board.views import wave_board
 
 BOARD = parse_board("charuco:10x8:80:60:DICT_5X5_100")
 POSES = 16

@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from capture4d.calibration_board import BoardView, parse_board
+from benchmarks.simulated_views import calibration_rig, simulate_views
+from capture4d.calibration.check import check_rig
+from capture4d.calibration.rig import Calibration, calibrate_rig
+from capture4d.cameras.board import BoardView, parse_board
+from capture4d.cameras.projection import rotation_from_vector
 from capture4d.errors import InputError
-from capture4d.projection import rotation_from_vector
-from capture4d.rig_calibration import Calibration, calibrate_rig
-from capture4d.rig_check import check_rig
 from capture4d.types import Rig
-from data_synth.board_views import calibration_rig, simulate_views, wave_board
+from data_synth.board.views import wave_board
 
 BOARD = parse_board("charuco:14x10:60:44:DICT_5X5_100")
 CAMERAS, POSES = 5, 24

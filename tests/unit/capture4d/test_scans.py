@@ -8,37 +8,32 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture4d.errors import InputError
-from capture4d.mesh_files import write_mesh
-from capture4d.scans import (
+from capture4d.captures.capture import (
     Capture,
-    TruthFrame,
-    TruthModel,
     capture_digest,
-    format_colour,
-    load_body,
-    load_garment,
-    load_rig,
     motion_digest,
-    parse_colour,
     read_capture,
     read_poses,
     read_scan,
     read_template,
-    read_truth_frame,
-    read_truth_model,
-    read_truth_vertices,
-    save_body,
-    save_garment,
-    save_poses,
-    save_rig,
     scan_digest,
     template_digest,
     write_capture_description,
     write_scan,
+)
+from capture4d.captures.truth import (
+    TruthFrame,
+    TruthModel,
+    read_truth_frame,
+    read_truth_model,
+    read_truth_vertices,
     write_truth_frame,
     write_truth_model,
 )
+from capture4d.colours.spaces import format_colour, parse_colour
+from capture4d.errors import InputError
+from capture4d.files.meshes import write_mesh
+from capture4d.files.records import load_body, load_garment, load_rig, save_body, save_garment, save_poses, save_rig
 from capture4d.types import Body, Garment, Mesh, PoseSequence, Rig, Scan
 
 FRAMES = (11, 12, 15)

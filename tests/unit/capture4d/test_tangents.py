@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from capture4d.mesh import vertex_normals
-from capture4d.tangents import TangentLayout, corner_tangents, tangent_frames
+from capture4d.geometry.mesh import vertex_normals
+from capture4d.geometry.tangents import TangentLayout, corner_tangents, tangent_frames
+from capture4d.geometry.uv_raster import rasterise_uv
 from capture4d.types import Mesh
-from capture4d.uv_raster import rasterise_uv
 
 
 def sheet(count: int = 9) -> Mesh:

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from capture4d.errors import InputError
+from capture4d.geometry.uv_layout import millimetres_per_texel, unit_square
+from capture4d.geometry.uv_raster import rasterise_uv
 from capture4d.types import Mesh
-from capture4d.uv_layout import millimetres_per_texel, unit_square
-from capture4d.uv_raster import rasterise_uv
 
 
 def panels(scale: float = 1.0) -> Mesh:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from capture4d.errors import InputError
+from capture4d.geometry.uv_raster import rasterise_uv, sample_bilinear
 from capture4d.types import Mesh
-from capture4d.uv_raster import rasterise_uv, sample_bilinear
 
 
 def square(uv: list[tuple[float, float]]) -> Mesh:

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from capture4d.body_anny import load_anny
-from capture4d.records import save_body, save_poses
-from capture4d.scans import Capture
+from capture4d.body.anny import load_anny
+from capture4d.captures.capture import Capture
+from capture4d.captures.work_folder import captured_motion
+from capture4d.files.records import save_body, save_poses
 from capture4d.types import PoseSequence
-from capture4d.work_folder import captured_motion
 
 
 def test_poses_without_a_body_move_the_built_in_one(tmp_path: Path) -> None:

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture4d.atomic_files import read_json, write_bytes, write_json, write_npy_rows, write_npz
 from capture4d.errors import InputError
-from capture4d.workdir import Stage, open_stage, require_complete
-from capture4d.workers import WorkerDied, run_jobs
+from capture4d.files.atomic import read_json, write_bytes, write_json, write_npy_rows, write_npz
+from capture4d.runs.stage import Stage, open_stage, require_complete
+from capture4d.runs.workers import WorkerDied, run_jobs
 
 FRAMES = (3, 4, 7)
 
@@ -91,7 +91,7 @@ def test_a_writer_killed_at_any_moment_leaves_whole_files_only(tmp_path: Path):
         """
         import sys, numpy as np
         from pathlib import Path
-        from capture4d.atomic_files import write_npz
+        from capture4d.files.atomic import write_npz
         print("ready", flush=True)
         for round in range(10**6):
             for frame in range(4):
@@ -281,7 +281,7 @@ def test_workers_do_not_outlive_a_killed_parent(tmp_path: Path):
             f"""
             import os, time
             from pathlib import Path
-            from capture4d.workers import run_jobs
+            from capture4d.runs.workers import run_jobs
 
             def announce(number):
                 Path({str(tmp_path)!r}, f"{{os.getpid()}}.pid").touch()

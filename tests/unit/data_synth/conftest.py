@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from capture4d.body import ShapedBody, with_shape
+from capture4d.body.skinning import ShapedBody, with_shape
 from capture4d.types import Body, Mesh
 
 JOINTS = {  # name: (parent, position); the skeleton of the parametric body, limbs reduced to tubes

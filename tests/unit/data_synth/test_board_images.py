@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from capture4d.calibration_board import parse_board
-from capture4d.corner_detection import detect_corners
-from capture4d.projection import rotation_from_vector, undistort
+from capture4d.calibration.corners import detect_corners
+from capture4d.cameras.board import parse_board
+from capture4d.cameras.projection import rotation_from_vector, undistort
 from capture4d.types import Rig
-from data_synth.board_images import BoardImageConfig, photograph_board
+from data_synth.board.images import BoardImageConfig, photograph_board
 
 BOARD = parse_board("charuco:7x5:60:44:DICT_4X4_50")
 CLEAN = BoardImageConfig(noise=0.0, blur_px=0.0, hands=0)

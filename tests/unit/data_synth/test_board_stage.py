@@ -6,15 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture4d.calibration_report import rig_difference
-from capture4d.calibration_stage import find_images
-from capture4d.calibration_stage import run as calibrate
+from capture4d.calibration.adjustment import RigEstimate
+from capture4d.calibration.report import rig_difference
+from capture4d.calibration.stage import find_images
+from capture4d.calibration.stage import run as calibrate
 from capture4d.errors import InputError
-from capture4d.records import load_rig, save_rig
-from capture4d.rig_adjustment import RigEstimate
-from data_synth.board_stage import run, shared_volume
+from capture4d.files.records import load_rig, save_rig
+from data_synth.board.stage import run, shared_volume
 from data_synth.config import BoardConfig
-from data_synth.rig import capture_rig
+from data_synth.scanner.rig import capture_rig
 
 CENTRE, RADIUS = (0.2, 1.3, -0.1), 0.6
 CONFIG = BoardConfig(poses=16, seed=3)

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks import damaged_takes as damage
+from benchmarks.plain_takes import PlainTake
 from capture4d.errors import EmptyMeshError, InputError, NotFiniteError
-from capture4d.mesh_files import read_mesh
+from capture4d.files.meshes import read_mesh
 from capture4d.types import Mesh, Scan
-from data_synth import damage
-from data_synth.plain_takes import PlainTake
 
 
 @pytest.fixture

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from data_synth.depth_noise import corrupt_depth, draw_noise_fields, periodic_gaussian_field, silhouettes
-from data_synth.scanner_config import NoiseConfig
+from data_synth.scanner.config import NoiseConfig
+from data_synth.scanner.depth_noise import corrupt_depth, draw_noise_fields, periodic_gaussian_field, silhouettes
 
 NO_LOSS = NoiseConfig(lost_cosine=0.0, weak_cosine=0.0, blob_loss=0.0)
 

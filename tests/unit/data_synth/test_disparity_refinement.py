@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from data_synth.depth_noise import periodic_gaussian_field
-from data_synth.disparity_refinement import refine_disparity
+from data_synth.scanner.depth_noise import periodic_gaussian_field
+from data_synth.scanner.disparity_refinement import refine_disparity
 
 SIZE, EDGE = 96, 48
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from capture4d.types import Mesh, Rig
-from data_synth.lighting import light
 from data_synth.outfits import OUTFITS
-from data_synth.raycast import Surface
-from data_synth.rig import capture_rig
-from data_synth.scanner_config import ShadingConfig
+from data_synth.scanner.config import ShadingConfig
+from data_synth.scanner.lighting import light
+from data_synth.scanner.raycast import Surface
+from data_synth.scanner.rig import capture_rig
 
 CENTRE = np.array([0.3, 1.1, -0.2])
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from capture4d.body import ShapedBody
-from capture4d.mesh import boundary_edges, unique_edges
+from capture4d.body.skinning import ShapedBody
+from capture4d.geometry.mesh import boundary_edges, unique_edges
+from data_synth.cloth.patterns import grade, locate, mesh_pattern, tshirt_pattern
 from data_synth.config import GarmentStyle
-from data_synth.patterns import grade, locate, mesh_pattern, tshirt_pattern
 
 
 @pytest.mark.parametrize("vertices", [600, 2500, 20_000])

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from capture4d.errors import InputError
-from data_synth.rig import bounding_sphere, capture_rig, look_at
+from data_synth.scanner.rig import bounding_sphere, capture_rig, look_at
 
 
 def project(rig, camera, points):

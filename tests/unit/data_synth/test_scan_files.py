@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture4d.scans import write_scan
+from capture4d.captures.capture import write_scan
+from capture4d.runs.stage import open_stage
 from capture4d.types import Mesh, Scan
-from capture4d.workdir import open_stage
 from data_synth.scan_files import is_whole_scan, pending_scans
 
 

@@ -4,25 +4,20 @@ import shutil
 import numpy as np
 import pytest
 
-from capture4d.atomic_files import read_json
+from capture4d.captures.capture import read_capture, read_scan, read_template
+from capture4d.captures.truth import read_truth_frame, read_truth_model
 from capture4d.errors import InputError
-from capture4d.evaluation import material_points, surface_distances
-from capture4d.mesh import boundary_loops, face_areas
-from capture4d.mesh_files import write_mesh
-from capture4d.scans import (
-    load_garment,
-    load_rig,
-    read_capture,
-    read_scan,
-    read_template,
-    read_truth_frame,
-    read_truth_model,
-)
+from capture4d.evaluation import material_points
+from capture4d.files.atomic import read_json
+from capture4d.files.meshes import write_mesh
+from capture4d.files.records import load_garment, load_rig
+from capture4d.geometry.closest_points import surface_distances
+from capture4d.geometry.mesh import boundary_loops, face_areas
 from capture4d.types import Mesh
-from data_synth.border_paint import paint_borders
 from data_synth.mesh_sequence import open_sequence
 from data_synth.scan_stage import _paint, run
-from data_synth.scanner_config import FusionConfig, RigConfig, ScanConfig, ScannerConfig, StereoConfig
+from data_synth.scanner.border_paint import paint_borders
+from data_synth.scanner.config import FusionConfig, RigConfig, ScanConfig, ScannerConfig, StereoConfig
 
 BLUE, YELLOW, RED = (47, 98, 201), (255, 210, 0), (229, 51, 42)
 SMALL = ScanConfig(

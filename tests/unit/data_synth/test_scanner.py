@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 
 from capture4d.errors import InputError
-from capture4d.mesh import vertex_normals
+from capture4d.geometry.mesh import vertex_normals
 from capture4d.types import Mesh, Rig
-from data_synth.fusion import canonical_order, drop_small_components
-from data_synth.raycast import NOTHING, Surface, SurfaceScene
-from data_synth.rig import capture_rig, look_at
-from data_synth.scanner import LABEL_BORDER, LABEL_GARMENT, scan_surfaces
-from data_synth.scanner_config import FusionConfig, NoiseConfig, ScannerConfig, ShadingConfig
+from data_synth.scanner.config import FusionConfig, NoiseConfig, ScannerConfig, ShadingConfig
+from data_synth.scanner.fusion import canonical_order, drop_small_components
+from data_synth.scanner.raycast import NOTHING, Surface, SurfaceScene
+from data_synth.scanner.rig import capture_rig, look_at
+from data_synth.scanner.scan import LABEL_BORDER, LABEL_GARMENT, scan_surfaces
 
 PERFECT = ScannerConfig(
     noise=NoiseConfig(sigma_m=0.0, silhouette_step_m=0.04, weak_loss=0.0, blob_loss=0.0),
@@ -172,7 +172,7 @@ def test_coarse_tiles_miss_nothing():
         whole = np.full((100, 100), NOTHING, np.uint8)
         top, left = images.origin
         whole[top : top + images.surface.shape[0], left : left + images.surface.shape[1]] = images.surface
-        from data_synth.raycast import _rays, _tensor
+        from data_synth.scanner.raycast import _rays, _tensor
 
         v, u = (index.ravel().astype(np.float32) for index in np.indices((100, 100)))
         answer = scene._scene.cast_rays(_tensor(_rays(rig, camera, u, v)))

@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from capture4d.body import ShapedBody, unskin
-from capture4d.mesh import unique_edges
+from capture4d.body.skinning import ShapedBody, unskin
+from capture4d.geometry.mesh import unique_edges
+from data_synth.cloth.patterns import mesh_pattern, tshirt_pattern
+from data_synth.cloth.simulation import approach_poses, dress, simulate
+from data_synth.cloth.template import bind_template
+from data_synth.cloth.wrinkle_relaxation import body_planes
 from data_synth.config import Fabric, GarmentStyle, MotionConfig, SimulationConfig
 from data_synth.motions import make_motion
-from data_synth.patterns import mesh_pattern, tshirt_pattern
-from data_synth.simulation import approach_poses, dress, simulate
-from data_synth.template import bind_template
-from data_synth.wrinkle_relaxation import body_planes
 
 SETTINGS = SimulationConfig(vertices=500, calm_frames=12, approach_frames=6, rest_frames=2)
 

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture4d.atomic_files import read_json, write_npz
 from capture4d.errors import InputError
+from capture4d.files.atomic import read_json, write_npz
 from data_synth.config import PRESETS, MotionConfig, RelaxationConfig, SimulationConfig, SynthConfig
-from data_synth.scanner_config import FusionConfig, RigConfig, ScannerConfig
+from data_synth.scanner.config import FusionConfig, RigConfig, ScannerConfig
 from data_synth.stage import is_whole, open_take, run, simulated_frames, simulation_jobs
 
 SMALLEST = replace(

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from capture4d.types import Mesh, Rig
-from data_synth.raycast import Surface, SurfaceScene
-from data_synth.rig import look_at, pod_rig
-from data_synth.scanner import LABEL_BODY, LABEL_BORDER, LABEL_GARMENT, scan_surfaces
-from data_synth.scanner_config import FusionConfig, ScannerConfig, StereoConfig
-from data_synth.stereo import SpecklePair, match_pair, speckle_pair
+from data_synth.scanner.config import FusionConfig, ScannerConfig, StereoConfig
+from data_synth.scanner.raycast import Surface, SurfaceScene
+from data_synth.scanner.rig import look_at, pod_rig
+from data_synth.scanner.scan import LABEL_BODY, LABEL_BORDER, LABEL_GARMENT, scan_surfaces
+from data_synth.scanner.stereo import SpecklePair, match_pair, speckle_pair
 
 POD = StereoConfig(pods=4, image_size=320, supersampling=1, speckle_window_px=60)
 WHITE = (200, 200, 200)

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture4d.atomic_files import read_json
-from capture4d.records import load_garment, load_poses
-from capture4d.scans import read_capture, read_truth_model, read_truth_vertices
+from capture4d.captures.capture import read_capture
+from capture4d.captures.truth import read_truth_model, read_truth_vertices
+from capture4d.files.atomic import read_json
+from capture4d.files.records import load_garment, load_poses
 from data_synth.config import TRAINING_SETS, RelaxationConfig, SimulationConfig, TrainingSetConfig
 from data_synth.training_set import body_takes, run
 

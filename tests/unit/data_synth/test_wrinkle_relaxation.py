@@ -8,10 +8,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from data_synth.cloth_quality import measure_cloth
+from data_synth.cloth.patterns import Edge, Panel, PanelMesh, Pattern, mesh_pattern
+from data_synth.cloth.quality import measure_cloth
+from data_synth.cloth.wrinkle_relaxation import WrinkleMesh, lift, relax_frame, wrinkle_mesh
 from data_synth.config import Fabric, RelaxationConfig
-from data_synth.patterns import Edge, Panel, PanelMesh, Pattern, mesh_pattern
-from data_synth.wrinkle_relaxation import WrinkleMesh, lift, relax_frame, wrinkle_mesh
 
 SIDE = 0.3
 FAR_BODY = np.array([[-9.0, -9.0, -9.0], [9.0, -9.0, -9.0], [0.0, 9.0, -9.0]])

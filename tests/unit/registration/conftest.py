@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from capture4d.mesh import boundary_loops
+from capture4d.geometry.mesh import boundary_loops
 from capture4d.types import Garment, GarmentScan, Mesh
 from registration.config import (
     BoundaryConfig,

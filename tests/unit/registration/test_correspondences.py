@@ -5,8 +5,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from capture4d.mesh import boundary_edges, connected_components, vertex_normals
-from capture4d.mesh_kernels import face_components, laplacian_pass, open_vertices
+from capture4d.geometry.mesh import boundary_edges, connected_components, vertex_normals
+from capture4d.geometry.mesh_kernels import face_components, laplacian_pass, open_vertices
 from capture4d.types import Mesh
 from registration.correspondences import match, match_both_ways, mesh_normals, prepare_scan
 

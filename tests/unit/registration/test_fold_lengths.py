@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from capture4d.mesh import unique_edges
+from capture4d.geometry.mesh import unique_edges
 from registration.correspondences import ScanSurface
 from registration.fold_lengths import edge_faces, folded_lengths
 from registration.point_grid import PointGrid

@@ -8,7 +8,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from capture4d.errors import InputError
-from capture4d.mesh import unique_edges
+from capture4d.geometry.mesh import unique_edges
 from capture4d.types import Garment, GarmentScan, Mesh
 from registration.config import PAPER, GraphConfig, LinearSolverConfig, RegistrationConfig
 from registration.register import prepare_frame, register_frame

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from capture4d.errors import InputError
-from capture4d.mesh_files import read_mesh, write_mesh
+from capture4d.extraction.garment import painted_border
+from capture4d.files.meshes import read_mesh, write_mesh
 from capture4d.types import Mesh
 from registration.config import SOFT, MeshRegistrationConfig, QualityConfig, Schedule
 from registration.register_mesh import guess_units, register_mesh, run
@@ -68,7 +69,11 @@ def test_painted_borders_are_measured(garment, scan_of, quick) -> None:
     height = np.linspace(0, 1, 80)[:, None] * np.ones(160)
     colours[(height.reshape(-1) < 0.03) | (height.reshape(-1) > 0.97)] = PAINT
     result = register_mesh(
-        garment.template, scan, colours=colours, config=replace(quick, boundary_colour="ffd200", units="m")
+        garment.template,
+        scan,
+        colours=colours,
+        find_border=painted_border,
+        config=replace(quick, boundary_colour="ffd200", units="m"),
     )
     assert result.quality.numbers["boundary_mean_mm"] < 4
 
@@ -89,13 +94,13 @@ def test_refusals(garment, scan_of, quick) -> None:
         register_mesh(template, scan, config=painted)
     grey = np.full((len(scan.vertices), 3), 128, np.uint8)
     with pytest.raises(InputError, match=r"border colour #ffd200 not found"):
-        register_mesh(template, scan, colours=grey, config=painted)
+        register_mesh(template, scan, colours=grey, find_border=painted_border, config=painted)
     with pytest.raises(InputError, match=r"expected the unit of template"):
         register_mesh(template, scaled(scan, 1000), config=quick)
     closed = Mesh(np.eye(4, 3, dtype=np.float32), np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], np.int32))
     paint = np.tile(np.array([PAINT], np.uint8), (len(scan.vertices), 1))
     with pytest.raises(InputError, match="expected open borders"):
-        register_mesh(closed, scan, colours=paint, config=painted)
+        register_mesh(closed, scan, colours=paint, find_border=painted_border, config=painted)
 
 
 def test_units_are_guessed_from_size(garment) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from capture4d.body import pose_frame, skin
+from capture4d.body.skinning import pose_frame, skin
 from capture4d.errors import InputError
 from capture4d.types import Body, Garment, Mesh, PoseSequence
 from registration.config import SequenceConfig

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from capture4d.mesh import unique_edges
+from capture4d.geometry.mesh import unique_edges
 from capture4d.types import Mesh
 from registration.template import analyse_template, rest_lengths
 

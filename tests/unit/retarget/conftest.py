@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from capture4d.atomic_files import write_bytes, write_npz
-from capture4d.body import pose_frame, skin, with_shape
-from capture4d.evaluation import closest_points
-from capture4d.mesh import boundary_loops
-from capture4d.records import save_body, save_garment, save_poses
+from capture4d.body.skinning import pose_frame, skin, with_shape
+from capture4d.captures.work_folder import REGISTER, VERDICTS, stack_vertices
+from capture4d.files.atomic import write_bytes, write_npz
+from capture4d.files.records import save_body, save_garment, save_poses
+from capture4d.geometry.closest_points import closest_points
+from capture4d.geometry.mesh import boundary_loops
+from capture4d.runs.stage import open_stage
 from capture4d.types import Body, Garment, Mesh, PoseSequence, RegisteredSequence
-from capture4d.work_folder import REGISTER, VERDICTS, stack_vertices
-from capture4d.workdir import open_stage
 
 NAMES = ("root", "middle", "top")
 

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from capture4d.body import skin
+from capture4d.body.skinning import skin
 from capture4d.errors import InputError
-from retarget.blendshapes import (
+from retarget.config import ShapeConfig
+from retarget.shapes.blendshapes import (
     ShapeSpace,
     fewest_directions,
     learn_shape_space,
@@ -15,7 +16,6 @@ from retarget.blendshapes import (
     skin_frames,
     worst_errors,
 )
-from retarget.config import ShapeConfig
 
 
 def low_rank(frames: int = 40, verts: int = 30, rank: int = 5, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -71,7 +71,7 @@ def test_reading_block_by_block_changes_nothing(monkeypatch: pytest.MonkeyPatch)
     weights = np.ones(frames.shape[:2])
     weights[3:9, :7] = 0.0
     whole = [learned(frames, weights, method=method) for method in ("exact", "randomised")]
-    monkeypatch.setattr("retarget.principal_directions.BLOCK_NUMBERS", 7 * frames[0].size)
+    monkeypatch.setattr("retarget.shapes.principal_directions.BLOCK_NUMBERS", 7 * frames[0].size)
     for method, expected in zip(("exact", "randomised"), whole, strict=True):
         found = learned(frames, weights, method=method)
         np.testing.assert_allclose(found.basis, expected.basis, atol=1e-8)

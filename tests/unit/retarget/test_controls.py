@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from capture4d.errors import InputError
 from retarget.config import ControlConfig
-from retarget.controls import ControlLayout, ControlStream, control_vectors, garment_joints
+from retarget.regression.controls import ControlLayout, ControlStream, control_vectors, garment_joints
 
 NAMES = ("root", "middle", "top")
 

@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from capture4d.types import PoseSequence
 from retarget.config import ControlConfig, KernelConfig, KernelTuningConfig
-from retarget.controls import ControlLayout, control_vectors
-from retarget.kernel import KernelRegressor, fit_kernel
-from retarget.kernel_tuning import Fold
-from retarget.kernel_views import kernel_views, likeness
-from retarget.regressors import Clip, FittingClips, mean_squared_error
+from retarget.regression.controls import ControlLayout, control_vectors
+from retarget.regression.kernel import KernelRegressor, fit_kernel
+from retarget.regression.kernel_tuning import Fold
+from retarget.regression.kernel_views import kernel_views, likeness
+from retarget.regression.regressors import Clip, FittingClips, mean_squared_error
 
 NAMES = ("root", "spine", "arm.L", "arm.R", "neck")
 CHOSEN = ControlLayout(NAMES, (1, 2, 3, 4), 60.0, ControlConfig(root_motion=False))

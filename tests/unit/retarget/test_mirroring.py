@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from capture4d.errors import InputError
 from capture4d.types import Mesh, PoseSequence
-from retarget.mirroring import Mirror, find_mirror, opposite_joints
+from retarget.shapes.mirroring import Mirror, find_mirror, opposite_joints
 
 NAMES = ("root", "arm.L", "arm.R", "spine", "hand.L", "hand.R")
 

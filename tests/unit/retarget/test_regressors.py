@@ -14,18 +14,18 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from capture4d.atomic_files import write_bytes
 from capture4d.errors import InputError
-from capture4d.tensor_files import read_tensors, write_tensors
+from capture4d.files.atomic import write_bytes
+from capture4d.files.tensors import read_tensors, write_tensors
 from capture4d.types import PoseSequence
 from retarget.config import ControlConfig, KernelConfig, LinearConfig, LstmConfig, TrainingConfig
-from retarget.controls import ControlLayout, control_vectors
-from retarget.ensemble import ensemble
-from retarget.kernel import fit_kernel, load_kernel, save_kernel
-from retarget.linear import fit_linear, load_linear, save_linear
-from retarget.lstm import EncoderDecoder, LstmRegressor, load_lstm, save_lstm
-from retarget.regressors import Clip, FittingClips, History, mean_squared_error, with_history
-from retarget.training import fit_lstm, train_lstm
+from retarget.regression.controls import ControlLayout, control_vectors
+from retarget.regression.ensemble import ensemble
+from retarget.regression.kernel import fit_kernel, load_kernel, save_kernel
+from retarget.regression.linear import fit_linear, load_linear, save_linear
+from retarget.regression.lstm import EncoderDecoder, LstmRegressor, load_lstm, save_lstm
+from retarget.regression.regressors import Clip, FittingClips, History, mean_squared_error, with_history
+from retarget.regression.training import fit_lstm, train_lstm
 
 NAMES = ("root", "middle", "top")
 SMALL = LstmConfig(layers=2, size=24, over_linear=False)
@@ -351,10 +351,10 @@ def test_a_run_that_stopped_anywhere_ends_with_the_same_bits(clips, tmp_path: Pa
 TRAIN = """
 import sys, pathlib, numpy as np
 from retarget.config import *
-from retarget.controls import ControlLayout
-from retarget.regressors import Clip, FittingClips, mean_squared_error
-from retarget.training import train_lstm
-from retarget.lstm import save_lstm
+from retarget.regression.controls import ControlLayout
+from retarget.regression.regressors import Clip, FittingClips, mean_squared_error
+from retarget.regression.training import train_lstm
+from retarget.regression.lstm import save_lstm
 rng = np.random.default_rng(0)
 layout = ControlLayout(("root", "a"), (1,), 60.0, ControlConfig())
 controls = rng.standard_normal((400, layout.size)).astype(np.float32)

@@ -7,14 +7,14 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from capture4d.body import with_pose, with_shape
+from capture4d.body.skinning import with_pose, with_shape
 from capture4d.errors import InputError
 from capture4d.types import BlendshapeModel, Body, Garment
-from retarget.bodies import captured_person, retargeted_mean
+from retarget.animation.bodies import captured_person, retargeted_mean
+from retarget.animation.intersections import BodySurface, IntersectionRemoval
 from retarget.config import RemovalConfig
-from retarget.intersections import BodySurface, IntersectionRemoval
-from retarget.pose_normalisation import unpose_frame
-from retarget.pose_range import nearest_poses, pose_quaternions
+from retarget.regression.pose_range import nearest_poses, pose_quaternions
+from retarget.shapes.pose_normalisation import unpose_frame
 
 
 def model_on(garment: Garment, body: Body, shape: tuple[float, float]) -> BlendshapeModel:

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 from capture4d.app.cli import main
-from capture4d.atomic_files import read_json, write_json
-from capture4d.blendshape_files import load_blendshapes
-from capture4d.body import pose_frame, skin, with_shape
+from capture4d.body.skinning import pose_frame, skin, with_shape
+from capture4d.captures.work_folder import load_moving_body, load_records, load_registration
 from capture4d.errors import InputError
-from capture4d.records import load_body, save_body, save_garment, save_poses
-from capture4d.tensor_files import read_tensors, write_tensors
-from capture4d.work_folder import load_moving_body, load_records, load_registration
-from retarget.animate_stage import run as animate_poses
+from capture4d.files.atomic import read_json, write_json
+from capture4d.files.records import load_body, save_body, save_garment, save_poses
+from capture4d.files.tensors import read_tensors, write_tensors
+from retarget.animation.stage import run as animate_poses
 from retarget.config import AnimateConfig, SplitConfig
-from retarget.splits import split_takes
+from retarget.regression.splits import split_takes
+from retarget.shapes.files import load_blendshapes
 
 QUICK = (
     "--shape.max-error-mm",

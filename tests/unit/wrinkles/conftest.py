@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture4d.atomic_files import write_bytes, write_npy, write_npz
-from capture4d.garment_stage import save_garment_scan
-from capture4d.mesh import boundary_loops
-from capture4d.records import save_garment
-from capture4d.scans import Capture, write_capture_description
+from capture4d.captures.capture import Capture, write_capture_description
+from capture4d.captures.garment_scans import save_garment_scan
+from capture4d.files.atomic import write_bytes, write_npy, write_npz
+from capture4d.files.records import save_garment
+from capture4d.geometry.mesh import boundary_loops
+from capture4d.runs.stage import open_stage
 from capture4d.types import Garment, GarmentScan, Mesh
-from capture4d.workdir import open_stage
 
 
 def sleeve(around: int, along: int) -> Mesh:

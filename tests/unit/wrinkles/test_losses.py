@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from wrinkles.losses import data_loss, gan_loss, temporal_loss
+from wrinkles.normal_maps.losses import data_loss, gan_loss, temporal_loss
 
 EVERYWHERE = torch.ones(1, 1, 16, 16, dtype=torch.bool)
 

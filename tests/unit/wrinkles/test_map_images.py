@@ -7,11 +7,11 @@ import pytest
 
 from capture4d.errors import InputError
 from capture4d.types import Garment, Mesh
-from wrinkles.config import MapConfig
-from wrinkles.display import fill_holes
-from wrinkles.map_spaces import decode_png, encode_png, flip_green
-from wrinkles.normal_maps import MapTemplate
-from wrinkles.seams import seam_table
+from wrinkles.normal_maps.config import MapConfig
+from wrinkles.normal_maps.display import fill_holes
+from wrinkles.normal_maps.seams import seam_table
+from wrinkles.normal_maps.spaces import decode_png, encode_png, flip_green
+from wrinkles.normal_maps.template import MapTemplate
 
 
 def some_normals(size: int = 24) -> np.ndarray:

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from wrinkles.map_metrics import angles, gradient_error, score, ssim, wrinkle_band
+from wrinkles.normal_maps.metrics import angles, gradient_error, score, ssim, wrinkle_band
 
 
 def waves(height: float, *, wavelength: float = 12.0, frames: int = 4, speed: float = 0.5) -> torch.Tensor:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from wrinkles.config import PRESETS, MapConfig, NetworkConfig
-from wrinkles.inference import WrinkleModel
-from wrinkles.networks import PatchDiscriminator, UNet, receptive_field, set_test_statistics
+from wrinkles.normal_maps.config import PRESETS, MapConfig, NetworkConfig
+from wrinkles.normal_maps.inference import WrinkleModel
+from wrinkles.normal_maps.networks import PatchDiscriminator, UNet, receptive_field, set_test_statistics
 
 PAPER = NetworkConfig()
 SMALL = NetworkConfig(filters=4, layers=5, output="residual", dropout=0.0)

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from capture4d.body import PosedBody, with_pose, with_shape
+from capture4d.body.skinning import PosedBody, with_pose, with_shape
 from capture4d.errors import InputError
 from capture4d.types import Body, Garment, Mesh, PoseSequence
 from tests.unit.wrinkles.conftest import sleeve, wrinkled
-from wrinkles.offset_images import Anchors, OffsetLayout, OffsetSampler, decode, encode
-from wrinkles.offset_networks import FullyConnected, ImageDecoder, PcaFullyConnected
-from wrinkles.offset_training import (
+from wrinkles.offset_images.layout import Anchors, OffsetLayout, OffsetSampler, decode, encode
+from wrinkles.offset_images.networks import FullyConnected, ImageDecoder, PcaFullyConnected
+from wrinkles.offset_images.training import (
     OffsetConfig,
     grid_loss,
     normal_loss,
@@ -57,7 +57,7 @@ def upright(body: Body) -> PosedBody:
 
 @pytest.fixture
 def bound(garment: Garment) -> tuple[Garment, Body]:
-    from capture4d.garment_binding import bind
+    from capture4d.body.binding import bind
 
     body = limb()
     at, weights, skin_weights = bind(garment.template.vertices, garment.template.faces, upright(body))

@@ -17,17 +17,17 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from capture4d.app.cli import main
-from capture4d.atomic_files import write_bytes, write_npy, write_npz
-from capture4d.mesh import submesh
-from capture4d.records import load_garment, save_garment
+from capture4d.files.atomic import write_bytes, write_npy, write_npz
+from capture4d.files.records import load_garment, save_garment
+from capture4d.geometry.mesh import submesh
+from capture4d.runs.stage import open_stage
 from capture4d.types import Garment, Mesh
-from capture4d.workdir import open_stage
 from tests.unit.wrinkles.conftest import make_work, outside_the_unit_square, some_garment, some_scan, wrinkle_normals
-from wrinkles import train_stage
-from wrinkles.config import MapConfig
-from wrinkles.display import fill_holes
-from wrinkles.map_spaces import decode_png, encode_png, from_tangent
-from wrinkles.normal_maps import MapTemplate
+from wrinkles.normal_maps import train_stage
+from wrinkles.normal_maps.config import MapConfig
+from wrinkles.normal_maps.display import fill_holes
+from wrinkles.normal_maps.spaces import decode_png, encode_png, from_tangent
+from wrinkles.normal_maps.template import MapTemplate
 
 SMALL = ["--pairs.map.size", "64", "--texels", "32", "--network.filters", "4", "--network.layers", "5",
          "--schedule.steps", "6", "--schedule.checkpoint-every", "2", "--schedule.sample-every", "3",

@@ -9,10 +9,17 @@ import torch
 from torch.nn.functional import normalize
 
 from capture4d.errors import InputError
-from wrinkles.config import AugmentationConfig, LossConfig, NetworkConfig, ScheduleConfig, TemporalLoss, WrinkleConfig
-from wrinkles.losses import data_loss, gan_loss, temporal_loss
-from wrinkles.pairs import PairTake, augmented, batches, fitted, halved, split
-from wrinkles.training import learning_rate, load_tensors, new_state, state_tensors, train_step
+from wrinkles.normal_maps.config import (
+    AugmentationConfig,
+    LossConfig,
+    NetworkConfig,
+    ScheduleConfig,
+    TemporalLoss,
+    WrinkleConfig,
+)
+from wrinkles.normal_maps.losses import data_loss, gan_loss, temporal_loss
+from wrinkles.normal_maps.pairs import PairTake, augmented, batches, fitted, halved, split
+from wrinkles.normal_maps.training import learning_rate, load_tensors, new_state, state_tensors, train_step
 
 CONFIG = WrinkleConfig(
     texels=32,

@@ -1,0 +1,34 @@
+"""Synthetic takes that tests and benchmarks share: made once, kept in the user's cache folder."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+from capture4d.runs.cache import user_cache_folder
+from data_synth import training_set
+from data_synth.config import SynthConfig, TrainingSetConfig
+from data_synth.stage import SCHEMA, run
+
+__all__ = ["cached_take", "cached_training_set"]
+
+
+def cached_take(config: SynthConfig, *, workers: int = 2) -> Path:
+    """The capture folder of a configuration; simulated and scanned if this machine has not done so before."""
+    folder = _folder(config, SCHEMA)
+    run(folder, config, workers=workers)
+    return folder
+
+
+def cached_training_set(config: TrainingSetConfig, *, workers: int = 2) -> Path:
+    """The folder of a training set; what this machine has not made before is made."""
+    folder = _folder(config, training_set.SCHEMA)
+    training_set.run(folder, config, workers=workers)
+    return folder
+
+
+def _folder(config: SynthConfig | TrainingSetConfig, schema: int) -> Path:
+    key = hashlib.sha256(json.dumps([schema, asdict(config)], sort_keys=True).encode()).hexdigest()[:12]
+    return user_cache_folder() / "takes" / f"{config.name}-{key}"

@@ -1,0 +1,142 @@
+"""`capture4d check`, `calibrate` and `check-rig`: the rig and the take, before a stage is run."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, UseAppendAction, arg
+
+from capture4d.app.commands.options import all_cores
+from capture4d.calibration.config import CalibrationConfig, RigCheckConfig
+
+__all__ = ["Calibrate", "Check", "CheckRig"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check:
+    """Look through a take before a night is spent on it; exit code 0: clean, 1: warnings, 2: errors."""
+
+    capture: Annotated[Positional[Path], arg(metavar="CAPTURE")]
+    """Capture folder, or just a folder of scans."""
+    frames: str | None = None
+    """How scans are named, such as "take_{frame}.ply"; else the last number in a name is the frame's."""
+    fps: float | None = None
+    """Frame rate, if capture.json does not say, or is to be doubted."""
+    units: Literal["m", "cm", "mm", "in"] | None = None
+    """What the scans are said to be in, likewise."""
+    garment_colour: str | None = None
+    """Such as #2f62c9, likewise."""
+    border_colour: UseAppendAction[tuple[str, ...]] = ()
+    """A paint on the borders, likewise; may be given several times."""
+    rig: Path | None = None
+    """rig.json, if it is not in the folder."""
+    poses: Path | None = None
+    """poses.npz, likewise."""
+    body: Path | None = None
+    """body.npz, likewise."""
+    all: bool = False
+    """Look at every frame instead of a sample."""
+    fix: bool = False
+    """Write a corrected take to CAPTURE-fixed; looks at every frame."""
+    json: bool = False
+    """Print JSON instead of a table."""
+    workers: int = field(default_factory=all_cores)
+    """Processes to use; the result does not depend on it."""
+
+    def __call__(self) -> int:
+        import json
+
+        from capture4d.app.report.check import as_json, exit_code, print_table
+        from capture4d.preflight.fix import write_fixed
+        from capture4d.preflight.stage import check_take
+        from capture4d.preflight.take_folder import Claims
+
+        claims = Claims(
+            self.frames,
+            self.fps,
+            self.units,
+            self.garment_colour,
+            self.border_colour,
+            self.rig,
+            self.poses,
+            self.body,
+        )
+        checked = check_take(self.capture, claims, all_frames=self.all or self.fix, workers=self.workers)
+        fixed = write_fixed(checked, workers=self.workers) if self.fix and checked.verdict.findings else None
+        if self.json:
+            print(json.dumps(as_json(checked, fixed=fixed), indent=2))
+        else:
+            print_table(checked)
+            if fixed is not None:
+                print(f"corrected: {fixed}")
+        return exit_code(checked.verdict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibrate:
+    """Calibrate a camera rig from images of a ChArUco board, with a report of how good it is."""
+
+    images: Annotated[Positional[Path], arg(metavar="IMAGES")]
+    """Folder of board images: png, jpg or tif, one a camera and pose of the board."""
+    board: str
+    """charuco:COLUMNSxROWS:SQUARE_MM:MARKER_MM:DICTIONARY, such as charuco:14x10:60:44:DICT_5X5_100."""
+    output: Path
+    """rig.json to write; calibration.json and calibration.html go beside it."""
+    pattern: str = "{camera}/{pose}"
+    """How the images lie in the folder, without their ending."""
+    workers: int = field(default_factory=all_cores)
+    """Processes to use; the result does not depend on it."""
+    colmap: Path | None = None
+    """Folder for the rig as a COLMAP model as well."""
+    config: Annotated[CalibrationConfig, arg(name="")] = field(default_factory=CalibrationConfig)
+
+    def __call__(self) -> int:
+        from capture4d.app.report.calibration import print_calibration, write_page
+        from capture4d.calibration.stage import run
+
+        report = run(
+            self.images,
+            self.output,
+            self.board,
+            self.config,
+            pattern=self.pattern,
+            colmap=self.colmap,
+            workers=self.workers,
+        )
+        print_calibration(report)
+        page = write_page(self.output.with_name("calibration.html"), report)
+        print(f"rig: {self.output}, report: {page}")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckRig:
+    """Tell which cameras have moved since calibration, from one pose of the board; exits with 1 if one has."""
+
+    rig: Annotated[Positional[Path], arg(metavar="RIG")]
+    """rig.json; the calibration.json beside it knows the board and how certain the rig is."""
+    images: Annotated[Positional[Path], arg(metavar="IMAGES")]
+    """Folder of board images: png, jpg or tif; one pose will do."""
+    board: str | None = None
+    """The board, if it is not the one of the calibration."""
+    pattern: str = "{camera}/{pose}"
+    """How the images lie in the folder, without their ending."""
+    workers: int = field(default_factory=all_cores)
+    """Processes to use; the result does not depend on it."""
+    config: Annotated[RigCheckConfig, arg(name="")] = field(default_factory=RigCheckConfig)
+
+    def __call__(self) -> int:
+        from capture4d.app.report.calibration import print_check
+        from capture4d.calibration.stage import run_check
+
+        checks = run_check(
+            self.rig, self.images, self.config, board=self.board, pattern=self.pattern, workers=self.workers
+        )
+        print_check(checks)
+        moved = [check.name for check in checks if check.verdict == "moved"]
+        if moved:
+            print(f"capture4d: moved since calibration: {', '.join(moved)}", file=sys.stderr)
+        return 1 if moved else 0

@@ -1,0 +1,146 @@
+"""`capture4d template`, `register-mesh` and the converters: single files in, single files out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from registration.config import MeshRegistrationConfig
+
+__all__ = ["ConvertBody", "ConvertPoses", "ConvertRig", "RegisterMesh", "Template"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Template:
+    """Make a template of your own garment mesh, or of a part of the body: bound, its borders named, its UVs checked."""
+
+    mesh: Annotated[Positional[Path | None], arg(metavar="MESH")] = None
+    """Garment mesh that lies on the body: obj, ply or glb. Left out with --region."""
+    output: Path
+    """template.npz to write, as in a capture folder."""
+    body: Path | None = None
+    """The body it lies on, a body.npz; the built-in one if absent."""
+    poses: Path | None = None
+    """Motion file with the pose and the shape in which the garment lies on the body; the rest pose of the mean shape if
+    absent."""
+    frame: int | None = None
+    """Frame of that file, by its number; the first if absent."""
+    region: Literal["tshirt", "longsleeve", "trousers", "shorts"] | None = None
+    """Take this part of the body as the garment."""
+    uv: Literal["auto", "keep", "fresh", "none"] = "auto"
+    """Keep the mesh's UVs or cut fresh ones; `auto` keeps them if nothing is wrong with them."""
+    names: tuple[str, ...] = ()
+    """Names of the border loops, the one with the most vertices first; found by their place if absent."""
+    units: Literal["m", "cm", "mm", "in"] = "m"
+    """Of the mesh."""
+
+    def __call__(self) -> int:
+        from capture4d.templates.stage import run
+
+        garment, report = run(
+            self.mesh,
+            self.output,
+            body=self.body,
+            poses=self.poses,
+            frame=self.frame,
+            region=self.region,
+            uv=self.uv,
+            names=self.names,
+            units=self.units,
+        )
+        loops = ", ".join(f"{name} ({len(loop)})" for name, loop in garment.loops.items())
+        faults = ", ".join(report.uv.faults())
+        cut = f"cut afresh{f' ({faults})' if faults else ''}"
+        uvs = "none" if garment.template.uv is None else cut if report.fresh_uv else "kept"
+        print(f"{report.vertices} vertices, {report.faces} faces, {1e3 * report.distance_m:.1f} mm from the body")
+        print(f"borders: {loops}")
+        print(f"UVs: {uvs}")
+        print(f"template: {self.output}")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegisterMesh:
+    """Register any template to any scan, two mesh files; writes the result, and its measures as JSON beside it."""
+
+    template: Annotated[Positional[Path], arg(metavar="TEMPLATE")]
+    """Mesh to deform: obj, ply or glb. Its vertex order and faces are kept."""
+    scan: Annotated[Positional[Path], arg(metavar="SCAN")]
+    """Mesh to fit it to: obj, ply or glb."""
+    output: Path
+    """Mesh to write: ply, obj or glb; the JSON has the same name."""
+    config: Annotated[MeshRegistrationConfig, arg(name="")] = field(default_factory=MeshRegistrationConfig)
+
+    def __call__(self) -> int:
+        from capture4d.extraction.garment import painted_border
+        from registration.register_mesh import run
+
+        run(self.template, self.scan, self.output, self.config, find_border=painted_border)
+        print(f"registered: {self.output}, measures: {self.output.with_suffix('.json')}")
+        return 0
+
+
+@dataclass(frozen=True)
+class ConvertBody:
+    """Convert a body model of the SMPL family, from your own licensed file, to a body.npz for captures."""
+
+    file: Annotated[Positional[Path], arg(metavar="FILE")]
+    """SMPL, SMPL-H or SMPL-X model, .npz, or .pkl (read without running its code)."""
+    output: Path
+    """File to write, as body.npz in a capture folder."""
+
+    def __call__(self) -> int:
+        from capture4d.body.smpl import convert_smpl
+
+        convert_smpl(self.file, self.output)
+        print(f"body: {self.output}")
+        return 0
+
+
+@dataclass(frozen=True)
+class ConvertRig:
+    """Convert a rig.json to a COLMAP model, or a COLMAP model to a rig.json."""
+
+    source: Annotated[Positional[Path], arg(metavar="SOURCE")]
+    """rig.json, or a folder with a COLMAP model, binary or text."""
+    output: Path
+    """Folder for the model, or rig.json."""
+    text: bool = False
+    """Write the model as text."""
+
+    def __call__(self) -> int:
+        from capture4d.calibration.stage import convert
+
+        convert(self.source, self.output, text=self.text)
+        print(f"rig: {self.output}")
+        return 0
+
+
+@dataclass(frozen=True)
+class ConvertPoses:
+    """Convert a motion between poses.npz, AMASS npz and BVH, retargeted to a body where the skeletons differ."""
+
+    input: Annotated[Positional[Path], arg(metavar="IN")]
+    """Motion file, .npz or .bvh; what kind of npz is told by its arrays."""
+    output: Annotated[Positional[Path], arg(metavar="OUT")]
+    """Motion file to write, .npz or .bvh."""
+    body: Path | None = None
+    """The body that moves, a body.npz; the built-in one if absent."""
+    format: Literal["poses", "amass"] = "poses"
+    """What kind of .npz to write."""
+    fps: float | None = None
+    """Frame rate of the result; that of the input if absent."""
+
+    def __call__(self) -> int:
+        from capture4d.body.anny import load_anny
+        from capture4d.body.motion_files import read_motion, write_motion
+        from capture4d.files.records import load_body
+
+        body = load_body(self.body) if self.body else load_anny()
+        poses = read_motion(self.input, body, fps=self.fps)
+        write_motion(self.output, body, poses, amass=self.format == "amass")
+        print(f"{len(poses.frame_ids)} poses at {poses.fps:g} fps: {self.output}")
+        return 0

@@ -1,0 +1,78 @@
+"""`capture4d fit` and `animate`: the garment as a model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from capture4d.app.commands.options import StageOptions
+from capture4d.errors import InputError
+from retarget.config import AnimateConfig, FitConfig
+
+__all__ = ["Animate", "Fit"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fit(StageOptions):
+    """Learn the garment from registered takes: its blendshapes, and the regressors that drive them with poses."""
+
+    works: Annotated[Positional[tuple[Path, ...]], arg(metavar="WORK")]
+    """Work folders of registered takes of one template and one person."""
+    output: Path | None = None
+    """Work folder that gets retarget/; the take's own if there is one take."""
+    device: str = "cpu"
+    """Where torch trains, such as cpu or cuda."""
+    config: Annotated[FitConfig, arg(name="")] = field(default_factory=FitConfig)
+
+    def __call__(self) -> int:
+        from retarget.fit_stage import run
+
+        if not self.works:
+            raise InputError("WORK: expected at least one work folder, found none")
+        first, *others = self.works
+        if self.output is None and others:
+            raise InputError(f"--output: expected a work folder for what {1 + len(others)} takes give, found none")
+        folder = (self.output or first) / "retarget"
+        works = [first, *others]
+        run(works, folder, self.config, device=self.device, workers=self.workers, overwrite=self.overwrite)
+        print(f"model: {folder}")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Animate(StageOptions):
+    """Put a learned garment on a motion, and on another body: a sequence like a registered one."""
+
+    model: Annotated[Positional[Path], arg(metavar="MODEL")]
+    """What `fit` wrote: WORK, WORK/retarget, or the blendshapes.safetensors in it."""
+    poses: Path
+    """Motion file, .npz or .bvh."""
+    output: Path
+    """Work folder; gets body/ and registration/."""
+    body: Path | None = None
+    """Another person, a body.npz of the same faces and joints."""
+    beta: tuple[float, ...] | None = None
+    """Shape of the person, in standard deviations; the captured person without --body and --beta."""
+    device: str = "cpu"
+    """Where torch computes, such as cpu or cuda."""
+    config: Annotated[AnimateConfig, arg(name="")] = field(default_factory=AnimateConfig)
+
+    def __call__(self) -> int:
+        from retarget.animation.stage import run
+
+        run(
+            self.model,
+            self.poses,
+            self.output,
+            self.config,
+            body=self.body,
+            beta=self.beta,
+            device=self.device,
+            workers=self.workers,
+            overwrite=self.overwrite,
+        )
+        print(f"registration: {self.output / 'registration'}")
+        return 0

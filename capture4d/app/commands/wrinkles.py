@@ -1,0 +1,111 @@
+"""The commands about wrinkles: `capture4d wrinkles maps`, `train`, `apply`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from capture4d.app.commands.options import StageOptions, all_cores
+from capture4d.app.compare.config import CompareConfig
+from wrinkles.normal_maps import config as wrinkle_config
+from wrinkles.normal_maps.config import PairConfig, WrinkleConfig
+
+__all__ = ["Compare", "WrinklesApply", "WrinklesMaps", "WrinklesTrain"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class WrinklesMaps(StageOptions):
+    """Make normal maps of a registered take: low ones from the template, high ones from its scans.
+
+    The model's answers to a take pair with its high maps: `capture4d animate MODEL --poses TAKE/body/poses.npz --output
+    WORK`, then `capture4d wrinkles maps WORK --high-from TAKE`.
+    """
+
+    work: Annotated[Positional[Path], arg(metavar="WORK")]
+    """Work folder; holds garment/ and registration/, gets wrinkles/pairs/."""
+    high_from: Path | None = None
+    """Work folder of the same frames, with finished maps, whose high ones are taken."""
+    config: Annotated[PairConfig, arg(name="")] = field(default_factory=PairConfig)
+
+    def __call__(self) -> int:
+        from wrinkles.normal_maps.pair_stage import run
+
+        run(self.work, self.config, high_from=self.high_from, workers=self.workers, overwrite=self.overwrite)
+        print(f"maps: {self.work / 'wrinkles' / 'pairs'}")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class WrinklesTrain(StageOptions):
+    """Train the network that turns low maps into high ones, on registered takes; makes their maps if need be."""
+
+    works: Annotated[Positional[tuple[Path, ...]], arg(metavar="WORK...")]
+    """Work folders of one garment."""
+    output: Path
+    """Model folder to write."""
+    preset: Literal[*wrinkle_config.PRESETS] = "small"
+    """What the settings below start from; `paper` is DeepWrinkles' network."""
+    config: Annotated[WrinkleConfig, arg(name="")] = field(default_factory=lambda: wrinkle_config.PRESETS["small"])
+    pairs: PairConfig = field(default_factory=PairConfig)
+    workers: int = field(default_factory=all_cores)
+    """Processes for the maps, threads for the training; equal numbers give equal weights."""
+
+    def __call__(self) -> int:
+        from wrinkles.normal_maps.train_stage import run
+
+        run(self.works, self.output, self.config, pairs=self.pairs, workers=self.workers, overwrite=self.overwrite)
+        print(f"model: {self.output}")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class WrinklesApply(StageOptions):
+    """Make tangent-space normal maps with wrinkles for a registered or animated take."""
+
+    model: Annotated[Positional[Path], arg(metavar="MODEL")]
+    """Model folder of `wrinkles train`, or its generator.safetensors."""
+    work: Annotated[Positional[Path], arg(metavar="WORK")]
+    """Work folder; holds registration/, gets wrinkles/generated/."""
+    flip_green: bool = False
+    """Y downwards, as DirectX and Unreal want it, instead of OpenGL's."""
+    bits: Literal[8, 16] = 16
+    """Per channel of the PNG files."""
+
+    def __call__(self) -> int:
+        from wrinkles.normal_maps.apply_stage import ApplyConfig, run
+
+        settings = ApplyConfig(flip_green=self.flip_green, bits=self.bits)
+        run(self.model, self.work, settings, workers=self.workers, overwrite=self.overwrite)
+        print(f"maps: {self.work / 'wrinkles' / 'generated' / 'frames'}")
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Compare(StageOptions):
+    """Compare registration, garment model, generated maps and offset images on the same held-out frames: one table, one
+    page."""
+
+    work: Annotated[Positional[Path], arg(metavar="WORK")]
+    """Work folder; holds garment/ and registration/, gets compare/."""
+    model: Path
+    """Model folder of `wrinkles train`."""
+    garment_model: Path | None = None
+    """What `fit` wrote; WORK/retarget, if there is one, by default."""
+    config: Annotated[CompareConfig, arg(name="")] = field(default_factory=CompareConfig)
+
+    def __call__(self) -> int:
+        from capture4d.app.compare.page import run
+
+        page = run(
+            self.work,
+            self.model,
+            self.config,
+            garment_model=self.garment_model,
+            workers=self.workers,
+            overwrite=self.overwrite,
+        )
+        print(f"comparison: {page}")
+        return 0

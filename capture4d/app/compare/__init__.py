@@ -1,0 +1,1 @@
+"""What gives a garment its surface, compared on the same held-out frames."""

@@ -1,0 +1,1 @@
+"""Pages and metrics: of a take, an animation, a calibration, a check."""

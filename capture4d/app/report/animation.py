@@ -1,0 +1,207 @@
+"""The report of an animated garment: WORK/report/index.html and metrics.json, as for a registered take."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping, Sequence
+from functools import lru_cache, partial
+from importlib.metadata import version
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+
+from capture4d.app.drawing.charts import Line
+from capture4d.app.drawing.panels import CLOTH, SKIN, VIEWS, Framing, Panel, data_uri
+from capture4d.app.drawing.render import Drawn, render
+from capture4d.app.report.metrics import column
+from capture4d.app.report.take import MAX_FLAGGED_ROWS, flat, is_current, joined_chart, shown, spread
+from capture4d.body.skinning import pose_frame, with_shape
+from capture4d.captures.work_folder import ANIMATE, VERDICTS, load_moving_body, load_records, load_registration
+from capture4d.files.atomic import read_json, write_bytes, write_json
+from capture4d.runs.stage import open_stage, require_complete
+from capture4d.runs.workers import run_jobs
+from capture4d.types import Body, PoseSequence, RegisteredSequence
+
+__all__ = ["ANIMATION_METRICS", "run"]
+
+SCHEMA = 1
+PICTURES = 8
+WIDTH, HEIGHT = 400, 370
+BLUE, ORANGE, GREEN, GREY = "#2f62c9", "#d9772b", "#2f8f5b", "#8d97a5"
+
+ANIMATION_METRICS: Mapping[str, tuple[str, str, str]] = {
+    "frames_good_percent": ("%", "higher", "frames with the verdict good"),
+    "frames_check": ("", "lower", "frames with the verdict check"),
+    "pose_distance_deg": ("deg", "lower", "to the nearest pose that the garment was learned from"),
+    "unlike_percent": ("%", "lower", "frames whose pose is unlike any that was learned"),
+    "inside_before_percent": ("%", "lower", "garment vertices inside the body before they were taken out"),
+    "depth_before_mm": ("mm", "lower", "the deepest of a frame before"),
+    "inside_body_percent": ("%", "lower", "garment vertices inside the body"),
+    "depth_mm": ("mm", "lower", "the deepest of a frame"),
+    "removal_moved_mm": ("mm", "lower", "how far taking them out has moved the others, mean"),
+    "stretch_p99": ("", "lower", "edge length over the mean garment's on this person, 99th percentile of a frame"),
+}
+"""Unit, better direction and meaning. Unless it says otherwise, it is the mean over the frames."""
+
+
+def run(work: Path, *, workers: int = 1, overwrite: bool = False) -> Path:
+    """Write the report, unless it is there and the animation has not changed; the path of its page.
+
+    Raises:
+        InputError: the animation is unfinished.
+    """
+    folder = work / "report"
+    command = f"capture4d animate MODEL --poses FILE --output {work}"
+    digest = require_complete(work / "registration", ANIMATE, command)
+    current = {"schema": SCHEMA, "config": {}, "upstream": {"registration": digest}}
+    if not overwrite and is_current(folder, current):
+        return folder / "index.html"
+    stale = (folder / "stage.json").exists()
+    stage = open_stage(folder, name="report", schema=SCHEMA, config={}, upstream=current["upstream"], overwrite=stale)
+    records = load_records(work / "registration")
+    summary = summarise(records)
+    rows = spread(len(records), PICTURES)
+    sequence = load_registration(work / "registration")
+    x, y, z = np.max([np.ptp(sequence.vertices[row], axis=0) for row in rows], axis=0).tolist()
+    _loaded.cache_clear()
+    draw = partial(_draw_row, work, Framing((1.3 * x, 1.15 * y, 1.3 * z)))
+    pictures = dict(run_jobs(draw, rows, workers=workers, label="draw"))
+    metrics = [
+        {"key": key, "value": value, "unit": ANIMATION_METRICS[key][0], "better": ANIMATION_METRICS[key][1]}
+        for key, value in summary.items()
+    ]
+    write_json(folder / "metrics.json", {"metrics": metrics, "capture": work.name, "frames": len(records)})
+    write_bytes(folder / "index.html", _page(work, records, summary, pictures, sequence).encode())
+    stage.finish([])
+    return folder / "index.html"
+
+
+def summarise(records: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """The metrics from the frames' records."""
+    good = sum(record["verdict"] == "good" for record in records)
+    unlike = column(records, "pose_distance_deg") > column(records, "unlike_deg")
+    special = {
+        "frames_good_percent": 100 * good / len(records),
+        "frames_check": float(len(records) - good),
+        "unlike_percent": 100 * float(unlike.mean()),
+    }
+    return {key: special.get(key, float(np.mean(column(records, key)))) for key in ANIMATION_METRICS
+            if key in special or key in records[0]}  # fmt: skip
+
+
+@lru_cache(maxsize=1)
+def _loaded(work: Path) -> tuple[RegisteredSequence, Body, PoseSequence]:
+    return load_registration(work / "registration"), *load_moving_body(work)
+
+
+def _draw_row(work: Path, framing: Framing, row: int) -> tuple[int, list[list[Panel]]]:
+    """The garment on the body, from both sides."""
+    sequence, body, poses = _loaded(work)
+    vertices = np.array(sequence.vertices[row])
+    posed = pose_frame(with_shape(body, poses.shape), poses, row).vertices().astype(np.float32)
+    drawn = [
+        Drawn(sequence.garment.template.with_vertices(vertices), CLOTH),
+        Drawn(body.template.with_vertices(posed), SKIN),
+    ]
+    views = [framing.view(vertices, direction) for direction in VIEWS]
+    return row, [
+        [Panel(direction.replace("_", " "), data_uri(render(drawn, view, width=WIDTH, height=HEIGHT)))]
+        for direction, view in zip(VIEWS, views, strict=True)
+    ]
+
+
+def _page(
+    work: Path,
+    records: Sequence[Mapping[str, Any]],
+    summary: Mapping[str, float],
+    pictures: Mapping[int, list[list[Panel]]],
+    sequence: RegisteredSequence,
+) -> str:
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("capture4d.app.report", "."), autoescape=True, undefined=jinja2.StrictUndefined
+    )
+    flagged = [record for record in records if record["verdict"] != "good"]
+    counts = {verdict: sum(record["verdict"] == verdict for record in records) for verdict in VERDICTS}
+    stage, poses = read_json(work / "registration" / "stage.json"), load_moving_body(work)[1]
+    template = sequence.garment.template
+    return environment.get_template("report.html.jinja").render(
+        title=work.resolve().name,
+        subtitle=f"{len(records)} frames, {len(records) / poses.fps:.1f} s at {poses.fps:g} fps; a learned garment of "
+        f"{len(template.vertices):,} vertices on a body of shape "
+        f"{', '.join(f'{value:.2g}' for value in poses.shape[:4])}.",
+        version=version("capture4d"),
+        tiles=[
+            {"name": name, "value": shown(summary[key]), "unit": ANIMATION_METRICS[key][0]}
+            for key, name in (
+                ("frames_good_percent", "frames are good"),
+                ("inside_before_percent", "was inside the body"),
+                ("inside_body_percent", "is inside the body"),
+                ("removal_moved_mm", "taking it out moved the rest"),
+                ("pose_distance_deg", "to the nearest learned pose"),
+            )
+        ],
+        strip=[(verdict, len(list(group))) for verdict, group in groupby(record["verdict"] for record in records)],
+        verdicts=[(verdict, count) for verdict, count in counts.items() if count],
+        flagged_columns=("pose distance, deg", "inside, %"),
+        flagged=[
+            {
+                "frame_id": record["frame_id"],
+                "verdict": record["verdict"],
+                "reasons": "; ".join(record["reasons"]),
+                "shown": [shown(record["pose_distance_deg"]), shown(record["inside_body_percent"])],
+            }
+            for record in flagged[:MAX_FLAGGED_ROWS]
+        ],
+        flagged_left_out=max(0, len(flagged) - MAX_FLAGGED_ROWS),
+        charts=_charts(records),
+        columns=2,
+        calibration=None,
+        comparison=None,
+        tracking=None,
+        extraction=[],
+        tracked=[],
+        scales=[],
+        pictures_note="The garment on the body, from the front and from behind.",
+        frames=[
+            {
+                "frame_id": records[row]["frame_id"],
+                "verdict": records[row]["verdict"],
+                "caption": "; ".join(records[row]["reasons"]),
+                "rows": panels,
+            }
+            for row, panels in sorted(pictures.items())
+        ],
+        metrics=[
+            {"key": key, "shown": shown(value), "unit": ANIMATION_METRICS[key][0], "meaning": ANIMATION_METRICS[key][2]}
+            for key, value in summary.items()
+        ],
+        run=[
+            ("Model", stage["sources"]["model"]),
+            ("Motion", stage["sources"]["poses"]),
+            ("Animated", f"{stage.get('started', '')} to {stage.get('finished', '')}"),
+            ("Digest", str(stage.get("digest", ""))[:16]),
+            ("Versions", ", ".join(f"{name} {version(name)}" for name in ("capture4d", "numpy", "torch"))),
+            ("Machine", f"{platform.system()} {platform.machine()}, Python {platform.python_version()}"),
+        ],
+        settings=list(flat(stage["config"])),
+    )
+
+
+def _charts(records: Sequence[Mapping[str, Any]]) -> Sequence[dict[str, str]]:
+    frames = [int(record["frame_id"]) for record in records]
+    inside = (("before", "inside_before_percent", GREY), ("after", "inside_body_percent", BLUE))
+    distance = (("pose", "pose_distance_deg", ORANGE), ("limit", "unlike_deg", GREY))
+    wanted = (
+        ("Inside the body, % of the vertices", inside),
+        ("Distance to the nearest learned pose, deg", distance),
+        ("How far the rest was moved, mm", (("mean", "removal_moved_mm", GREEN),)),
+        ("Stretch of edges", (("99 %", "stretch_p99", BLUE),)),
+    )
+    charts = []
+    for title, curves in wanted:
+        lines = [Line(name, column(records, key), tint) for name, key, tint in curves]
+        charts.append({"title": title, "svg": joined_chart(frames, lines, 0.0)})
+    return charts

@@ -1,0 +1,82 @@
+"""The verdict of `capture4d check`: an exit code, JSON for machines, a table for people."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from capture4d.preflight.stage import Checked
+from capture4d.preflight.verdict import Verdict
+
+__all__ = ["as_json", "exit_code", "print_table"]
+
+LEARNED = (
+    "No garment_colour is given: extract and track will learn the colours from the scans. "
+    "Garment and borders are not looked at here without --garment-colour and --border-colour."
+)
+
+
+def exit_code(verdict: Verdict) -> int:
+    """0 clean, 1 warnings, 2 errors."""
+    return max((2 if finding.severity == "error" else 1 for finding in verdict.findings), default=0)
+
+
+def as_json(checked: Checked, *, fixed: Path | None = None) -> dict[str, Any]:
+    """The verdict for machines; docs/preflight.md describes it."""
+    return {
+        "format": 1,
+        "capture": str(checked.take.path),
+        "status": ("clean", "warnings", "errors")[exit_code(checked.verdict)],
+        "frames": len(checked.take.files),
+        "frames_checked": checked.frames,
+        "colours": "learned" if _learns(checked) else "given",
+        "findings": [
+            {
+                "code": finding.code,
+                "severity": finding.severity,
+                "found": finding.found,
+                "advice": finding.advice,
+                "score": round(finding.score, 3),
+                "frames": list(finding.frames),
+            }
+            for finding in checked.verdict.findings
+        ],
+        "scores": {code: round(score, 3) for code, score in checked.verdict.scores.items()},
+        "fixed": None if fixed is None else str(fixed),
+    }
+
+
+def _learns(checked: Checked) -> bool:
+    """The take does not say which colour its garment has."""
+    return checked.take.facts.paints.garment is None
+
+
+def print_table(checked: Checked) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    looked = f"{checked.frames} of {len(checked.take.files)} frames"
+    if checked.verdict.findings:
+        table = Table("", "finding", "what was found", "what to do", title=f"{checked.take.path} ({looked} looked at)")
+        for finding in checked.verdict.findings:
+            frames = f"\nframes {_ranges(finding.frames)}" if finding.frames else ""
+            table.add_row(finding.severity, finding.code, finding.found + frames, finding.advice)
+        console.print(table)
+    else:
+        console.print(f"{checked.take.path}: clean ({looked} looked at)", highlight=False, soft_wrap=True)
+    if _learns(checked):
+        console.print(LEARNED, highlight=False, soft_wrap=True)
+
+
+def _ranges(numbers: Sequence[int], most: int = 6) -> str:
+    """'3-5, 9, ...'"""
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][1] + 1:
+            runs[-1][1] = number
+        else:
+            runs.append([number, number])
+    shown = [str(a) if a == b else f"{a}-{b}" for a, b in runs[:most]]
+    return ", ".join(shown + ["..."] * (len(runs) > most))

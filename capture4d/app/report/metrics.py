@@ -1,0 +1,115 @@
+"""What the report says about a take: the metrics, from the frames' records and from the truth.
+
+docs/report.md explains them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from capture4d.captures.truth import TruthModel
+from capture4d.captures.work_folder import VERDICTS
+from capture4d.evaluation import (
+    border_errors,
+    correspondence_errors,
+    drift_per_frame,
+    drift_ratio,
+    material_points,
+    truth_distances,
+)
+from capture4d.types import RegisteredSequence
+
+__all__ = ["METRICS", "column", "summarise", "truth_measures"]
+
+METRICS: Mapping[str, tuple[str, str, str]] = {
+    "fit_mean_mm": ("mm", "lower", "template vertices to the scan's surface, where it has data"),
+    "fit_p95_mm": ("mm", "lower", "the same, 95th percentile of a frame"),
+    "scan_fit_mean_mm": ("mm", "lower", "scan points to the template"),
+    "scan_fit_p95_mm": ("mm", "lower", "the same, 95th percentile of a frame"),
+    "boundary_mean_mm": ("mm", "lower", "template border to the painted border of the scan, and back"),
+    "boundary_p95_mm": ("mm", "lower", "the same, 95th percentile of a frame"),
+    "covered_percent": ("%", "higher", "template vertices with scan data"),
+    "stretch_p99": ("", "lower", "edge length over the template's, 99th percentile of a frame"),
+    "flipped_faces": ("", "lower", "faces against the scan they lie on, per frame"),
+    "self_intersections": ("", "lower", "faces that cut another, per frame"),
+    "frames_good_percent": ("%", "higher", "frames with the verdict good"),
+    "frames_check": ("", "lower", "frames with the verdict check"),
+    "frames_failed": ("", "lower", "frames with the verdict failed"),
+    "cpu_s": ("s", "lower", "CPU time per frame, median"),
+    "track_good_percent": ("%", "higher", "frames in which the tracked body has the verdict good"),
+    "track_median_mm": ("mm", "lower", "points on skin and suit to the tracked body, median of a frame"),
+    "track_cpu_s": ("s", "lower", "CPU time of tracking per frame, median"),
+    "joint_mean_mm": ("mm", "lower", "tracked joints that were seen to their true places"),
+    "joint_max_mm": ("mm", "lower", "the same, worst joint of a frame"),
+    "truth_distance_mean_mm": ("mm", "lower", "template vertices with scan data to the noise-free surface"),
+    "truth_distance_p95_mm": ("mm", "lower", "the same, 95th percentile of a frame"),
+    "truth_return_mean_mm": ("mm", "lower", "the noise-free surface to the template"),
+    "truth_return_p95_mm": ("mm", "lower", "the same, 95th percentile of a frame"),
+    "correspondence_mean_mm": ("mm", "lower", "template vertices to the true places of the same material"),
+    "correspondence_p95_mm": ("mm", "lower", "the same, 95th percentile of a frame"),
+    "drift_mm_per_frame": ("mm", "lower", "slope of the correspondence error over the frames"),
+    "drift_ratio": ("", "lower", "correspondence error of the last 20 frames over that of the first 20"),
+    "border_mean_mm": ("mm", "lower", "template border to the true border curve, and back"),
+    "border_p95_mm": ("mm", "lower", "the same, 95th percentile of a frame"),
+}
+"""Unit, better direction and meaning of every metric. Unless it says otherwise, it is the mean over the frames."""
+
+
+def summarise(records: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
+    """The take's metrics from its frames' records; None where no frame has the number."""
+    count = {verdict: sum(record["verdict"] == verdict for record in records) for verdict in VERDICTS}
+    special = {
+        "frames_good_percent": 100 * count["good"] / len(records),
+        "frames_check": float(count["check"]),
+        "frames_failed": float(count["failed"]),
+        "cpu_s": float(np.nanmedian(column(records, "cpu_s"))),
+    }
+    summary: dict[str, float | None] = {}
+    correspondence = column(records, "correspondence_mean_mm")
+    measured = np.flatnonzero(np.isfinite(correspondence))
+    if len(measured) > 1:
+        gap = (measured[-1] - measured[0]) / (len(measured) - 1)
+        special["drift_mm_per_frame"] = drift_per_frame(correspondence[measured]) / gap
+        special["drift_ratio"] = drift_ratio(correspondence[measured])
+    for key in METRICS:
+        if key in special:
+            summary[key] = special[key]
+        elif any(key in record for record in records):
+            values = column(records, key)
+            summary[key] = float(values[np.isfinite(values)].mean()) if np.isfinite(values).any() else None
+    return summary
+
+
+def truth_measures(
+    registered: RegisteredSequence, row: int, model: TruthModel, truth_vertices: np.ndarray
+) -> dict[str, float]:
+    """The measures against truth of one frame, millimetres."""
+    garment = registered.garment
+    vertices = np.asarray(registered.vertices[row])
+    mesh, truth = garment.template.with_vertices(vertices), model.fine.with_vertices(truth_vertices)
+    there, back = truth_distances(mesh, truth, covered=np.isfinite(registered.residual_m[row]))
+    places = material_points(truth_vertices, truth.faces, model.template_faces, model.template_barycentric)
+    border = border_errors(
+        {name: vertices[loop] for name, loop in garment.loops.items()},
+        {name: truth_vertices[loop] for name, loop in model.loops.items()},
+    )
+    measures = {}
+    for name, errors in (
+        ("truth_distance", there),
+        ("truth_return", back),
+        ("correspondence", correspondence_errors(vertices, places)),
+        ("border", border),
+    ):
+        if len(errors):
+            measures[f"{name}_mean_mm"] = 1e3 * float(errors.mean())
+            measures[f"{name}_p95_mm"] = 1e3 * float(np.percentile(errors, 95))
+    return measures
+
+
+def column(records: Sequence[Mapping[str, Any]], key: str) -> np.ndarray:
+    """One number of every frame; NaN where it was not measured."""
+    return np.array([math.nan if record.get(key) is None else record[key] for record in records], float)

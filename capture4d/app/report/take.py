@@ -1,0 +1,427 @@
+"""The report of a work folder: WORK/report/index.html, self-contained, and WORK/report/metrics.json.
+
+docs/report.md defines every metric. Those against truth appear where the capture has one.
+"""
+
+from __future__ import annotations
+
+import math
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import lru_cache, partial
+from importlib.metadata import version
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+
+from capture4d.app.drawing.charts import Line, line_chart
+from capture4d.app.drawing.panels import Framing, Panel, colour_bar, draw_frame, readable_scan
+from capture4d.app.report.metrics import METRICS, column, summarise, truth_measures
+from capture4d.app.report.stages import (
+    Calibration,
+    Comparison,
+    StagePictures,
+    Tracking,
+    calibration,
+    comparison,
+    comparison_digest,
+    draw_stages,
+    tracking,
+)
+from capture4d.captures.capture import Capture, read_capture
+from capture4d.captures.truth import TruthModel, read_truth_model, read_truth_vertices
+from capture4d.captures.work_folder import VERDICTS, capture_path, load_records, load_registration
+from capture4d.evaluation import correspondence_errors, material_points
+from capture4d.files.atomic import read_json, write_bytes, write_json
+from capture4d.runs.stage import open_stage, require_complete
+from capture4d.runs.workers import run_jobs
+from capture4d.types import RegisteredSequence
+
+__all__ = ["MAX_FLAGGED_ROWS", "ReportConfig", "flat", "is_current", "joined_chart", "run", "shown", "spread"]
+
+SCHEMA = 3
+MAX_FLAGGED_ROWS = 60
+BLUE, ORANGE, GREEN, GREY = "#2f62c9", "#d9772b", "#2f8f5b", "#8d97a5"
+CURVES: tuple[tuple[str, float, tuple[tuple[str, str, str], ...]], ...] = (
+    (
+        "Fit, mm",
+        0.0,
+        (
+            ("mean", "fit_mean_mm", BLUE),
+            ("95 %", "fit_p95_mm", GREY),
+            ("scan to template", "scan_fit_mean_mm", GREEN),
+        ),
+    ),
+    ("Painted border, mm", 0.0, (("mean", "boundary_mean_mm", BLUE), ("95 %", "boundary_p95_mm", GREY))),
+    (
+        "Against the truth, mm",
+        0.0,
+        (
+            ("correspondence", "correspondence_mean_mm", ORANGE),
+            ("surface", "truth_distance_mean_mm", BLUE),
+            ("border", "border_mean_mm", GREEN),
+        ),
+    ),
+    ("CPU time a frame, s", 0.0, (("registration", "cpu_s", BLUE),)),
+    ("Stretch of edges", 1.0, (("99 %", "stretch_p99", BLUE),)),
+    (
+        "Faces at fault",
+        0.0,
+        (("self-intersecting", "self_intersections", ORANGE), ("flipped", "flipped_faces", BLUE)),
+    ),
+)
+"""Charts: title, start of the vertical axis, and curves (name, metric, colour)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stages:
+    """What came before registration, and after."""
+
+    calibration: Calibration | None
+    tracking: Tracking | None
+    pictures: Sequence[StagePictures]
+    comparison: Comparison | None
+
+
+@dataclass(frozen=True, slots=True)
+class ReportConfig:
+    """What the report shows."""
+
+    pictures: int = 6
+    """Frames drawn, spread over the take; the worst flagged frame comes on top."""
+    stage_pictures: int = 3
+    """Frames whose extraction and tracking are drawn."""
+    truth_frames: int = 240
+    """Frames measured against the truth at most, spread over the take."""
+
+
+def run(
+    work: Path,
+    *,
+    capture: Path | None = None,
+    config: ReportConfig = ReportConfig(),
+    workers: int = 1,
+    overwrite: bool = False,
+) -> Path:
+    """Write the report, unless it is there and what it shows has not changed; the path of its page.
+
+    Args:
+        work: folder with a finished registration/.
+        capture: the capture folder, if it has moved since.
+    Raises:
+        InputError: the registration is unfinished, or the capture is not where it was.
+    """
+    folder = work / "report"
+    place = capture_path(work) if capture is None else capture
+    digest = require_complete(work / "registration", "register", f"capture4d register {place} --output {work}")
+    upstream = {"registration": digest}
+    compared = comparison_digest(work)
+    if compared is not None:
+        upstream["compare"] = compared
+    current = {"schema": SCHEMA, "config": asdict(config), "upstream": upstream}
+    if not overwrite and is_current(folder, current):
+        return folder / "index.html"
+    description = read_capture(place)
+    stale = (folder / "stage.json").exists()
+    stage = open_stage(folder, name="report", schema=SCHEMA, config=config, upstream=upstream, overwrite=stale)
+    records = load_records(work / "registration")
+    _measure_truth(work, description, records, config, workers)
+    tracked = tracking(description, work)
+    summary = summarise(records)
+    if tracked is not None:
+        summary |= tracked.metrics
+    heat = {"fit error": summary.get("fit_p95_mm"), "correspondence error": summary.get("correspondence_p95_mm")}
+    scales = {title: _round_up(value) for title, value in heat.items() if value is not None}
+    rows = _draw(work, description, _drawn_rows(records, config.pictures), scales, workers)
+    stages = Stages(
+        calibration(description, work),
+        tracked,
+        draw_stages(
+            work,
+            description,
+            _registered(work / "registration"),
+            spread(len(records), config.stage_pictures),
+            workers=workers,
+        ),
+        comparison(work),
+    )
+    write_json(
+        folder / "metrics.json",
+        {
+            "metrics": [
+                {"key": key, "value": value, "unit": METRICS[key][0], "better": METRICS[key][1]}
+                for key, value in summary.items()
+            ],
+            "capture": description.name,
+            "frames": len(records),
+        },
+    )
+    page = _page(work, description, records, summary, scales, rows, stages)
+    write_bytes(folder / "index.html", page.encode())
+    stage.finish([])  # the report holds times, which differ between equal runs; nothing is made from it
+    return folder / "index.html"
+
+
+# --- frames ------------------------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=1)
+def _registered(folder: Path) -> RegisteredSequence:
+    return load_registration(folder)
+
+
+@lru_cache(maxsize=1)
+def _model(capture: Path) -> TruthModel | None:
+    return read_truth_model(read_capture(capture))
+
+
+def _measure_truth(
+    work: Path, capture: Capture, records: list[dict[str, Any]], config: ReportConfig, workers: int
+) -> None:
+    """Add the measures against truth to the records of the frames that have them."""
+    _registered.cache_clear()
+    _model.cache_clear()
+    if _model(capture.path) is None:
+        return
+    rows = spread(len(records), config.truth_frames)
+    measure = partial(_measure_row, work, capture)
+    for row, measures in run_jobs(measure, rows, workers=workers, label="measure against truth"):
+        records[row].update(measures)
+
+
+def _measure_row(work: Path, capture: Capture, row: int) -> tuple[int, dict[str, float]]:
+    registered, model = _registered(work / "registration"), _model(capture.path)
+    assert model is not None
+    return row, truth_measures(registered, row, model, read_truth_vertices(capture, int(registered.frame_ids[row])))
+
+
+def _draw(
+    work: Path, capture: Capture, rows: list[int], scales: Mapping[str, float], workers: int
+) -> dict[int, list[list[Panel]]]:
+    registered = _registered(work / "registration")
+    x, y, z = np.max([np.ptp(vertices, axis=0) for vertices in registered.vertices], axis=0).tolist()
+    framing = Framing((x, y, z))
+    draw = partial(_draw_row, work, capture, framing, dict(scales))
+    return dict(run_jobs(draw, rows, workers=workers, label="draw"))
+
+
+def _draw_row(
+    work: Path, capture: Capture, framing: Framing, scales: dict[str, float], row: int
+) -> tuple[int, list[list[Panel]]]:
+    registered, model = _registered(work / "registration"), _model(capture.path)
+    frame_id, vertices = int(registered.frame_ids[row]), np.array(registered.vertices[row])
+    errors = {}
+    if "fit error" in scales:
+        errors["fit error"] = (1e3 * registered.residual_m[row].astype(float), scales["fit error"])
+    if model is not None and "correspondence error" in scales:
+        fine = read_truth_vertices(capture, frame_id)
+        places = material_points(fine, model.fine.faces, model.template_faces, model.template_barycentric)
+        values = 1e3 * correspondence_errors(vertices, places)
+        errors["correspondence error"] = (values, scales["correspondence error"])
+    colours = dict(capture.boundary_colours)
+    return row, draw_frame(
+        readable_scan(capture, frame_id),
+        registered.garment,
+        vertices,
+        framing,
+        errors_mm=errors,
+        border_colours=colours,
+    )
+
+
+def _drawn_rows(records: Sequence[Mapping[str, Any]], count: int) -> list[int]:
+    """Rows spread over the take, and the flagged frame that fits worst."""
+    rows = set(spread(len(records), count))
+    flagged = [row for row, record in enumerate(records) if record["verdict"] != "good"]
+    if flagged:
+        rows.add(
+            max(flagged, key=lambda row: (VERDICTS.index(records[row]["verdict"]), records[row].get("fit_p95_mm") or 0))
+        )
+    return sorted(rows)
+
+
+def spread(total: int, count: int) -> list[int]:
+    return sorted({round(float(row)) for row in np.linspace(0, total - 1, min(total, count))})
+
+
+# --- page --------------------------------------------------------------------------------------------------------
+
+
+def _page(
+    work: Path,
+    capture: Capture,
+    records: Sequence[Mapping[str, Any]],
+    summary: Mapping[str, float | None],
+    scales: Mapping[str, float],
+    pictures: Mapping[int, list[list[Panel]]],
+    stages: Stages,
+) -> str:
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("capture4d.app.report", "."), autoescape=True, undefined=jinja2.StrictUndefined
+    )
+    flagged = [record for record in records if record["verdict"] != "good"]
+    counts = {verdict: sum(record["verdict"] == verdict for record in records) for verdict in VERDICTS}
+    seconds = (capture.frame_ids[-1] - capture.frame_ids[0] + 1) / capture.fps
+    template = _registered(work / "registration").garment.template
+    return environment.get_template("report.html.jinja").render(
+        title=capture.name,
+        subtitle=f"{len(records)} frames, {seconds:.1f} s at {capture.fps:g} fps; a template of "
+        f"{len(template.vertices):,} vertices registered to every scan.",
+        version=version("capture4d"),
+        tiles=list(_tiles(summary)),
+        strip=[(verdict, len(list(group))) for verdict, group in groupby(record["verdict"] for record in records)],
+        verdicts=[(verdict, count) for verdict, count in counts.items() if count],
+        flagged_columns=("fit mean, mm", "border mean, mm"),
+        pictures_note="Scan, registered template, and errors, from the front and from behind.",
+        flagged=[
+            {
+                "frame_id": record["frame_id"],
+                "verdict": record["verdict"],
+                "reasons": "; ".join(record["reasons"]),
+                "shown": [shown(record.get("fit_mean_mm")), shown(record.get("boundary_mean_mm"))],
+            }
+            for record in flagged[:MAX_FLAGGED_ROWS]
+        ],
+        flagged_left_out=max(0, len(flagged) - MAX_FLAGGED_ROWS),
+        charts=list(_charts(records)),
+        columns=2 + len(scales),
+        calibration=stages.calibration,
+        comparison=stages.comparison,
+        tracking=_tracking_part(stages.tracking),
+        extraction=[{"frame_id": records[each.row]["frame_id"], "panels": each.extraction} for each in stages.pictures],
+        tracked=[
+            {"frame_id": records[each.row]["frame_id"], "panels": each.tracking}
+            for each in stages.pictures
+            if each.tracking
+        ],
+        scales=[{"title": title, "high": f"{high:g}", "uri": colour_bar(high)} for title, high in scales.items()],
+        frames=[
+            {
+                "frame_id": records[row]["frame_id"],
+                "verdict": records[row]["verdict"],
+                "caption": _caption(records[row]),
+                "rows": panels,
+            }
+            for row, panels in sorted(pictures.items())
+        ],
+        metrics=[
+            {"key": key, "shown": shown(value), "unit": METRICS[key][0], "meaning": METRICS[key][2]}
+            for key, value in summary.items()
+        ],
+        run=list(_run_rows(work, capture, records)),
+        settings=list(flat(read_json(work / "registration" / "stage.json")["config"])),
+    )
+
+
+def _tracking_part(tracked: Tracking | None) -> dict[str, Any] | None:
+    """Tracking as the page shows it."""
+    if tracked is None:
+        return None
+    flagged = tracked.flagged()
+    return {
+        "tiles": tracked.section.tiles,
+        "charts": tracked.section.charts,
+        "flagged": [
+            {"frame_id": each["frame_id"], "verdict": each["verdict"], "reasons": "; ".join(each["reasons"])}
+            for each in flagged[:MAX_FLAGGED_ROWS]
+        ],
+        "left_out": max(0, len(flagged) - MAX_FLAGGED_ROWS),
+        "unseen": [f"{limb} ({count} of {len(tracked.records)} frames)" for limb, count in tracked.unseen],
+    }
+
+
+def _tiles(summary: Mapping[str, float | None]) -> Sequence[dict[str, str]]:
+    names = {
+        "frames_good_percent": "frames are good",
+        "fit_mean_mm": "fit to the scan",
+        "boundary_mean_mm": "painted border",
+        "truth_distance_mean_mm": "distance to the true surface",
+        "correspondence_mean_mm": "correspondence error",
+        "border_mean_mm": "true border",
+        "cpu_s": "CPU a frame, median",
+    }
+    return [
+        {"name": name, "value": shown(summary[key]), "unit": METRICS[key][0]}
+        for key, name in names.items()
+        if key in summary
+    ]
+
+
+def _charts(records: Sequence[Mapping[str, Any]]) -> Sequence[dict[str, str]]:
+    frames = [int(record["frame_id"]) for record in records]
+    charts = []
+    for title, floor, wanted in CURVES:
+        lines = [Line(name, column(records, key), colour) for name, key, colour in wanted if _any(records, key)]
+        if lines:
+            charts.append({"title": title, "svg": joined_chart(frames, lines, floor)})
+    return charts
+
+
+def joined_chart(frames: list[int], lines: list[Line], floor: float) -> str:
+    """Frames without any value are left out, so that measures taken on every n-th frame join up."""
+    kept = np.flatnonzero(np.any([np.isfinite(line.values) for line in lines], axis=0))
+    shorter = [Line(line.name, line.values[kept], line.colour) for line in lines]
+    return line_chart([frames[row] for row in kept], shorter, floor=floor)
+
+
+def _caption(record: Mapping[str, Any]) -> str:
+    named = {"fit": "fit_mean_mm", "border": "boundary_mean_mm", "correspondence": "correspondence_mean_mm"}
+    parts = [f"{name} {shown(record[key])} mm" for name, key in named.items() if record.get(key) is not None]
+    return " · ".join([*parts, *record["reasons"]])
+
+
+def _run_rows(work: Path, capture: Capture, records: Sequence[Mapping[str, Any]]) -> Sequence[tuple[str, str]]:
+    record = read_json(work / "registration" / "stage.json")
+    garment = _registered(work / "registration").garment
+    cpu = column(records, "cpu_s")
+    loops = ", ".join(f"{name} ({len(loop)})" for name, loop in garment.loops.items()) or "none"
+    return [
+        ("Capture", str(capture.path.resolve())),
+        ("Frames", f"{len(records)}, numbers {capture.frame_ids[0]} to {capture.frame_ids[-1]}, {capture.fps:g} fps"),
+        ("Template", f"{len(garment.template.vertices):,} vertices, {len(garment.template.faces):,} faces"),
+        ("Border loops", loops),
+        ("Registered", f"{record.get('started', '')} to {record.get('finished', '')}"),
+        ("CPU time", f"{np.nansum(cpu):.1f} s in all, {np.nanmedian(cpu):.2f} s a frame"),
+        ("Command", f"capture4d run {capture.path} --output {work}"),
+        ("Digest", str(record.get("digest", ""))[:16]),
+        ("Versions", ", ".join(f"{name} {version(name)}" for name in ("capture4d", "numpy", "scipy", "open3d"))),
+        ("Machine", f"{platform.system()} {platform.machine()}, Python {platform.python_version()}"),
+    ]
+
+
+# --- small things ------------------------------------------------------------------------------------------------
+
+
+def is_current(folder: Path, current: Mapping[str, Any]) -> bool:
+    if not all((folder / name).is_file() for name in ("stage.json", "index.html", "metrics.json")):
+        return False
+    record = read_json(folder / "stage.json")
+    return record.get("status") == "complete" and all(record.get(key) == value for key, value in current.items())
+
+
+def _any(records: Sequence[Mapping[str, Any]], key: str) -> bool:
+    return bool(np.isfinite(column(records, key)).any())
+
+
+def shown(value: float | None) -> str:
+    if value is None or not math.isfinite(value):
+        return "–"
+    if value == round(value) and abs(value) < 1e6:
+        return f"{value:.0f}"
+    return f"{value:.3g}"
+
+
+def _round_up(value: float) -> float:
+    """The next of 1, 2 and 5 times a power of ten."""
+    power = 10.0 ** math.floor(math.log10(max(value, 1e-3)))
+    return next(factor * power for factor in (1, 2, 5, 10) if factor * power >= value * 0.999)
+
+
+def flat(value: Any, prefix: str = "") -> Sequence[tuple[str, str]]:
+    if not isinstance(value, dict):
+        return [(prefix, str(value))]
+    return [row for key, entry in value.items() for row in flat(entry, f"{prefix}.{key}" if prefix else key)]

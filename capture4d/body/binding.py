@@ -1,0 +1,95 @@
+"""A garment mesh bound to a body: the surface point under each vertex, and the skin weights that move it.
+
+Nearest body points jump where a sleeve hangs beside the trunk, so weights are diffused over the garment. A template
+that was made on one person is moved to another by how the body points under it move: the cloth keeps its distance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float, Float32, Int32
+from scipy.sparse import csr_array
+
+from capture4d.body.skinning import PosedBody, with_shape
+from capture4d.errors import InputError
+from capture4d.geometry.mesh import vertex_adjacency
+from capture4d.heavy_imports import import_open3d
+from capture4d.types import Body, Garment
+
+__all__ = ["WEIGHT_SMOOTHING", "bind", "diffuse", "embedded_offset", "with_body_shape"]
+
+WEIGHT_SMOOTHING = 12
+"""Diffusion steps on the skin weights: nearest body points jump from trunk to arm under a sleeve."""
+OFFSET_SMOOTHING = 12
+"""The same on the way to another shape, for the same reason."""
+
+
+def bind(
+    vertices: Float[np.ndarray, "verts 3"], faces: Int32[np.ndarray, "faces 3"], body: PosedBody
+) -> tuple[Int32[np.ndarray, " verts"], Float32[np.ndarray, "verts 3"], Float[np.ndarray, "verts joints"]]:
+    """The nearest body point of each vertex, as face and barycentric coordinates, and smooth skin weights.
+
+    Args:
+        vertices: on the body, best in a pose where the limbs are well apart.
+    """
+    scene = import_open3d().t.geometry.RaycastingScene(nthreads=1)
+    body_faces = body.shaped.body.template.faces
+    scene.add_triangles(body.vertices().astype(np.float32), body_faces.astype(np.uint32))
+    closest = scene.compute_closest_points(vertices.astype(np.float32))
+    at, uv = closest["primitive_ids"].numpy().astype(np.int32), closest["primitive_uvs"].numpy()
+    barycentric = np.column_stack([1 - uv.sum(axis=1), uv]).astype(np.float32)
+    weights = np.einsum("vk,vkj->vj", barycentric, body.shaped.body.skin_weights[body_faces[at]])
+    weights = diffuse(weights, faces, WEIGHT_SMOOTHING)
+    return at, barycentric, weights / weights.sum(axis=1, keepdims=True)
+
+
+def diffuse(
+    values: Float[np.ndarray, "verts channels"], faces: Int32[np.ndarray, "faces 3"], steps: int
+) -> Float[np.ndarray, "verts channels"]:
+    """Half way to the mean of the neighbours, so many times; vertices without neighbours stay."""
+    adjacency = vertex_adjacency(faces, len(values))
+    degree = np.diff(adjacency.indptr)
+    mean = csr_array(
+        (np.repeat(1 / np.maximum(degree, 1), degree), adjacency.indices, adjacency.indptr), shape=adjacency.shape
+    )
+    alone = (degree == 0)[:, None]
+    for _ in range(steps):
+        values = np.where(alone, values, 0.5 * (values + mean @ values))
+    return values
+
+
+def with_body_shape(garment: Garment, body: Body, shape: Float[np.ndarray, " shapes"]) -> Garment:
+    """The garment moved, in the rest pose, from the person it was bound to onto another shape of the same body.
+
+    A garment that does not say whom it was bound to, or to which points, is returned as it is.
+
+    Raises:
+        InputError: the garment is bound to faces that the body does not have.
+    """
+    if garment.body_shape is None or garment.embedding_faces is None or garment.embedding_barycentric is None:
+        return garment
+    change = with_shape(body, shape).vertices - with_shape(body, garment.body_shape).vertices
+    moved = garment.template.vertices + embedded_offset(garment, body, change)
+    template = garment.template.with_vertices(moved.astype(np.float32))
+    return replace(garment, template=template, body_shape=np.asarray(shape, np.float32))
+
+
+def embedded_offset(garment: Garment, body: Body, change: Float[np.ndarray, "skin 3"]) -> Float[np.ndarray, "verts 3"]:
+    """How the garment moves, in the rest pose, when the body's surface changes: with the points it is bound to.
+
+    Args:
+        change: displacement of each body vertex, metres.
+    Raises:
+        InputError: the garment is not bound, or to faces that the body does not have.
+    """
+    if garment.embedding_faces is None or garment.embedding_barycentric is None:
+        raise InputError("template: expected an embedding in the body, found none; bind it to a body")
+    if garment.embedding_faces.max(initial=0) >= len(body.template.faces):
+        count = len(body.template.faces)
+        raise InputError(f"template: expected an embedding in the body's {count} faces, found face "
+                         f"{garment.embedding_faces.max()}")  # fmt: skip
+    corners = change[body.template.faces[garment.embedding_faces]]
+    offset = np.einsum("vk,vkc->vc", garment.embedding_barycentric, corners)
+    return diffuse(offset, garment.template.faces, OFFSET_SMOOTHING)

@@ -1,0 +1,308 @@
+"""Calibration and check of a rig, as files: a folder of board images in, rig.json and calibration.json out."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from capture4d.calibration.check import CameraCheck, check_rig
+from capture4d.calibration.config import CALIBRATION, RIG_CHECK, CalibrationConfig, RigCheckConfig
+from capture4d.calibration.corners import detect_corners
+from capture4d.calibration.report import calibration_report
+from capture4d.calibration.rig import calibrate_rig
+from capture4d.calibration.uncertainty import CAMERA_UNKNOWNS
+from capture4d.cameras.board import Board, BoardView, parse_board
+from capture4d.cameras.colmap import read_model, write_model
+from capture4d.errors import InputError
+from capture4d.files.arrays import ArrayFile
+from capture4d.files.atomic import read_json, write_json, write_npz
+from capture4d.files.records import load_rig, save_rig
+from capture4d.runs.workers import run_jobs
+
+__all__ = ["BoardImage", "convert", "find_images", "run", "run_check"]
+
+PATTERN = "{camera}/{pose}"
+ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+DETECTOR = "fitted pattern"
+"""Corners that an earlier detector has kept are found anew."""
+REPORT, CORNERS, COVARIANCE = "calibration.json", "calibration_corners.npz", "calibration_covariance.npz"
+
+
+@dataclass(frozen=True, slots=True)
+class BoardImage:
+    """One image of a calibration, by its names."""
+
+    camera: str
+    pose: str
+    path: Path
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Detection:
+    image: BoardImage
+    size: tuple[int, int]
+    ids: np.ndarray
+    pixels: np.ndarray
+
+
+def run(
+    images: Path,
+    output: Path,
+    board: str,
+    config: CalibrationConfig = CALIBRATION,
+    *,
+    pattern: str = PATTERN,
+    colmap: Path | None = None,
+    workers: int = 1,
+) -> dict[str, Any]:
+    """Calibrate the rig that took a folder of images; what calibration.json says.
+
+    The corners are kept beside the rig, so that a run after a failure, or with other settings, detects only new images.
+
+    Args:
+        output: rig.json to write; calibration.json goes beside it.
+        board: as `parse_board` takes it.
+        pattern: how the images lie in the folder.
+        colmap: folder for the rig as a COLMAP model as well.
+    Raises:
+        InputError: names the image, the camera, or the argument at fault.
+    """
+    geometry = parse_board(board)
+    found = find_images(images, pattern)
+    names, poses = (sorted({getattr(image, key) for image in found}, key=_natural) for key in ("camera", "pose"))
+    if config.floor is not None and config.floor not in poses:
+        raise InputError(f"--floor: expected one of the poses {poses[0]} to {poses[-1]}, found '{config.floor}'")
+    detections = _detect_all(found, geometry, output.with_name(CORNERS), images, workers)
+    sizes = _image_sizes(detections, names)
+    calibration = calibrate_rig(
+        _views(detections, names, poses),
+        geometry,
+        names=names,
+        image_sizes=sizes,
+        poses=len(poses),
+        floor=None if config.floor is None else poses.index(config.floor),
+        config=config,
+    )
+    save_rig(output, calibration.estimate.rig)
+    if colmap is not None:
+        write_model(colmap, calibration.estimate.rig)
+    report = calibration_report(calibration, geometry, pose_names=poses, config=config)
+    report = {"format": 1, "board": board, "images": len(found), "config": dataclasses.asdict(config), **report}
+    digest = _rig_digest(output)
+    write_npz(
+        output.with_name(COVARIANCE), names=np.array(names), covariance=calibration.covariance, rig=np.array(digest)
+    )
+    write_json(output.with_name(REPORT), {**report, "rig": digest})
+    return report
+
+
+def run_check(
+    rig_path: Path,
+    images: Path,
+    config: RigCheckConfig = RIG_CHECK,
+    *,
+    board: str | None = None,
+    pattern: str = PATTERN,
+    workers: int = 1,
+) -> list[CameraCheck]:
+    """Test every camera of a calibrated rig against images of the board.
+
+    Args:
+        board: if None, the one in the calibration.json beside the rig.
+    Raises:
+        InputError: names the file, the camera or the argument at fault.
+    """
+    rig = load_rig(rig_path)
+    beside = rig_path.with_name(REPORT)
+    digest = _rig_digest(rig_path)
+    report = read_json(beside) if beside.is_file() else {}
+    spec = board or (report.get("board") if report.get("rig") == digest else None)
+    if spec is None:
+        fault = f"{beside} is of another {rig_path.name}" if report else f"there is no {beside} that names it"
+        raise InputError(f"--board: expected one, for {fault}")
+    geometry = parse_board(spec)
+    found = find_images(images, pattern)
+    strangers = sorted({image.camera for image in found} - set(rig.names))
+    if strangers:
+        raise InputError(f"{images}: expected cameras of {rig_path}, found {', '.join(strangers)}")
+    poses = sorted({image.pose for image in found}, key=_natural)
+    detections = list(run_jobs(partial(_detect, geometry), found, workers=workers, label="find the board"))
+    detections.sort(key=lambda detection: (detection.image.camera, _natural(detection.image.pose)))
+    for detection in detections:
+        width, height = (int(size) for size in rig.image_sizes[rig.names.index(detection.image.camera)])
+        if detection.size != (width, height):
+            seen = "x".join(str(size) for size in detection.size)
+            raise InputError(f"{detection.image.path}: expected {width}x{height} pixels as in the rig, found {seen}")
+    covariance = _read_covariance(rig_path.with_name(COVARIANCE), digest, cameras=len(rig.names))
+    return check_rig(rig, _views(detections, rig.names, poses), geometry, covariance=covariance, config=config)
+
+
+def convert(source: Path, output: Path, *, text: bool = False) -> None:
+    """A rig.json to a COLMAP model, or a folder with a COLMAP model to a rig.json.
+
+    Raises:
+        InputError: neither, or damaged.
+    """
+    if source.is_dir():
+        save_rig(output, read_model(source))
+    else:
+        write_model(output, load_rig(source), text=text)
+
+
+def find_images(folder: Path, pattern: str = PATTERN) -> list[BoardImage]:
+    """The images of a folder, ordered by camera and pose.
+
+    Args:
+        pattern: the path of an image in the folder without its ending; {camera} and {pose} stand for the names.
+    Raises:
+        InputError: the pattern lacks one of the two, no image matches it, or two images have the same names.
+    """
+    if sorted(re.findall(r"{(.*?)}", pattern)) != ["camera", "pose"]:
+        raise InputError(f"--pattern: expected {{camera}} and {{pose}} once each, found '{pattern}'")
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder")
+    expression = re.escape(pattern.strip("/"))
+    for name in ("camera", "pose"):
+        expression = expression.replace(re.escape(f"{{{name}}}"), f"(?P<{name}>[^/]+?)")
+    paths = [path for path in sorted(folder.rglob("*")) if path.suffix.lower() in ENDINGS and path.is_file()]
+    if not paths:
+        raise InputError(f"{folder}: expected images ({', '.join(ENDINGS)}), found none")
+    found: dict[tuple[str, str], BoardImage] = {}
+    for path in paths:
+        match = re.fullmatch(expression, path.relative_to(folder).with_suffix("").as_posix())
+        if match is None:
+            continue
+        image = BoardImage(match["camera"], match["pose"], path)
+        twin = found.setdefault((image.camera, image.pose), image)
+        if twin is not image:
+            raise InputError(f"{path}: expected one image of a camera and a pose, found {twin.path} as well")
+    if not found:
+        raise InputError(f"{paths[0]}: expected images that lie as --pattern '{pattern}' says, found none")
+    return sorted(found.values(), key=lambda image: (_natural(image.camera), _natural(image.pose)))
+
+
+# --- detections --------------------------------------------------------------------------------------------------
+
+
+def _detect(board: Board, image: BoardImage) -> _Detection:
+    try:
+        picture = cv2.imdecode(
+            np.frombuffer(image.path.read_bytes(), np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+        )
+    except cv2.error:
+        picture = None
+    if picture is None:
+        raise InputError(f"{image.path}: not a readable image, cut off or damaged")
+    ids, pixels = detect_corners(picture, board)
+    return _Detection(image, (picture.shape[1], picture.shape[0]), ids, pixels)
+
+
+def _detect_all(
+    images: Sequence[BoardImage], board: Board, cache: Path, folder: Path, workers: int
+) -> list[_Detection]:
+    """Detect the corners of all images but those that an earlier run has seen, in the order of the images."""
+    known = _read_corners(cache, board)
+    keys = {image: _file_key(image, folder) for image in images}
+    new = [image for image in images if keys[image] not in known]
+    detections = {image: known[keys[image]] for image in images if keys[image] in known}
+    try:
+        for detection in run_jobs(partial(_detect, board), new, workers=workers, label="find the board"):
+            detections[detection.image] = (detection.size, detection.ids, detection.pixels)
+    finally:  # an image that cannot be read must not cost those that can
+        if new and detections:
+            _write_corners(cache, board, {keys[image]: found for image, found in detections.items()})
+    return [_Detection(image, *detections[image]) for image in images]
+
+
+def _write_corners(
+    cache: Path, board: Board, found: Mapping[str, tuple[tuple[int, int], np.ndarray, np.ndarray]]
+) -> None:
+    write_npz(
+        cache,
+        board=np.array(f"{board}, {DETECTOR}"),
+        keys=np.array(list(found)),
+        sizes=np.array([size for size, _, _ in found.values()], np.int32),
+        counts=np.array([len(ids) for _, ids, _ in found.values()], np.int32),
+        ids=np.concatenate([ids for _, ids, _ in found.values()]),
+        pixels=np.concatenate([pixels for _, _, pixels in found.values()]),
+    )
+
+
+def _read_corners(cache: Path, board: Board) -> dict[str, tuple[tuple[int, int], np.ndarray, np.ndarray]]:
+    if not cache.is_file():
+        return {}
+    with ArrayFile(cache) as arrays:
+        if str(arrays["board"]) != f"{board}, {DETECTOR}":
+            return {}
+        ends = np.cumsum(arrays["counts"])[:-1]
+        return {
+            str(key): ((int(size[0]), int(size[1])), ids, pixels)
+            for key, size, ids, pixels in zip(
+                arrays["keys"],
+                arrays["sizes"],
+                np.split(arrays["ids"], ends),
+                np.split(arrays["pixels"], ends),
+                strict=True,
+            )
+        }
+
+
+def _file_key(image: BoardImage, folder: Path) -> str:
+    """Changes when the file does."""
+    status = image.path.stat()
+    return f"{image.path.relative_to(folder).as_posix()} {status.st_size} {status.st_mtime_ns}"
+
+
+def _image_sizes(detections: Sequence[_Detection], names: Sequence[str]) -> np.ndarray:
+    """(C, 2) int32: width and height, which have to be the same in all images of a camera."""
+    first: dict[str, _Detection] = {}
+    for detection in detections:
+        usual = first.setdefault(detection.image.camera, detection)
+        if detection.size != usual.size:
+            expected, seen = ("x".join(str(size) for size in entry.size) for entry in (usual, detection))
+            raise InputError(
+                f"{detection.image.path}: expected {expected} pixels as in {usual.image.path.name}, found {seen}"
+            )
+    return np.array([first[name].size for name in names], np.int32)
+
+
+def _views(detections: Sequence[_Detection], names: Sequence[str], poses: Sequence[str]) -> list[BoardView]:
+    camera_index = {name: index for index, name in enumerate(names)}
+    pose_index = {name: index for index, name in enumerate(poses)}
+    return [
+        BoardView(camera_index[entry.image.camera], pose_index[entry.image.pose], entry.ids, entry.pixels)
+        for entry in detections
+        if len(entry.ids)
+    ]
+
+
+def _rig_digest(path: Path) -> str:
+    """What the files beside a rig.json name it by."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _read_covariance(path: Path, rig_digest: str, *, cameras: int) -> np.ndarray | None:
+    """Of the calibration, (C, 14, C, 14), if it is that of this rig."""
+    if not path.is_file():
+        return None
+    with ArrayFile(path) as arrays:
+        if str(arrays.get("rig")) != rig_digest:
+            return None
+        covariance = arrays["covariance"]
+    if covariance.shape != (cameras, CAMERA_UNKNOWNS) * 2:
+        raise InputError(f"{path}: expected {cameras} x {CAMERA_UNKNOWNS} unknowns squared, found {covariance.shape}")
+    return covariance
+
+
+def _natural(name: str) -> list[tuple[int, int | str]]:
+    """Sort key that puts cam9 before cam10."""
+    return [(0, int(part)) if part.isdigit() else (1, part) for part in re.split(r"(\d+)", name) if part]

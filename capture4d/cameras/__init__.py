@@ -1,0 +1,1 @@
+"""Cameras and the board they look at: projection, COLMAP's files."""

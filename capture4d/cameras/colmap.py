@@ -1,0 +1,167 @@
+"""COLMAP models (cameras, images, rigs, frames; binary or text) as the exchange format of rigs.
+
+COLMAP puts the centre of the first pixel at (0.5, 0.5), we and OpenCV at (0, 0). This module is the one place where
+that half pixel is added or taken away. Lengths stay metres, and the axes of a camera are the same: x right, y down,
+z forward; a COLMAP pose (`cam_from_world`) is our T_camera_world.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from capture4d.errors import InputError
+from capture4d.heavy_imports import import_pycolmap
+from capture4d.types import Rig
+
+__all__ = ["colmap_camera", "lens_of", "read_model", "sensor", "to_colmap_pixels", "write_model"]
+
+HALF_PIXEL = 0.5
+PARTS = ("cameras", "images", "rigs", "frames", "points3D")
+# Where the parameters of a COLMAP camera model lie in fx fy cx cy k1 k2 p1 p2 k3.
+_PARAMETERS = {
+    "SIMPLE_PINHOLE": (0, 0, 1, 2),
+    "PINHOLE": (0, 1, 2, 3),
+    "SIMPLE_RADIAL": (0, 0, 1, 2, 3),
+    "RADIAL": (0, 0, 1, 2, 3, 4),
+    "OPENCV": (0, 1, 2, 3, 4, 5, 6, 7),
+    "FULL_OPENCV": (0, 1, 2, 3, 4, 5, 6, 7, 8),
+}
+
+
+def to_colmap_pixels(pixels: Float64[np.ndarray, "points 2"]) -> Float64[np.ndarray, "points 2"]:
+    """Pixels with centres at integers, as COLMAP counts them."""
+    return pixels + HALF_PIXEL
+
+
+def colmap_camera(
+    camera_id: int,
+    intrinsics: Float64[np.ndarray, "3 3"],
+    distortion: Float64[np.ndarray, " 5"],
+    image_size: np.ndarray,
+) -> Any:
+    """A pycolmap.Camera: OPENCV, or FULL_OPENCV where there is a k3.
+
+    Raises:
+        InputError: the intrinsics are skewed, which no COLMAP model knows.
+    """
+    if intrinsics[0, 1] != 0 or intrinsics[1, 0] != 0:
+        raise InputError(f"intrinsics: expected no skew for a COLMAP model, found {intrinsics[0, 1]:g}")
+    centre = intrinsics[:2, 2] + HALF_PIXEL
+    parameters = [intrinsics[0, 0], intrinsics[1, 1], *centre, *distortion[:4]]
+    full = bool(distortion[4] != 0)
+    return import_pycolmap().Camera(
+        camera_id=camera_id,
+        model="FULL_OPENCV" if full else "OPENCV",
+        width=int(image_size[0]),
+        height=int(image_size[1]),
+        params=[*parameters, distortion[4], 0, 0, 0] if full else parameters,
+    )
+
+
+def lens_of(camera: Any) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, " 5"]]:
+    """Intrinsics and distortion of a pycolmap.Camera.
+
+    Raises:
+        InputError: its model is not a special case of OpenCV's five coefficients.
+    """
+    model, given = camera.model.name, np.asarray(camera.params, np.float64)
+    places = _PARAMETERS.get(model)
+    if places is None or np.any(given[9:] != 0):
+        wanted = ", ".join(_PARAMETERS)
+        raise InputError(f"camera {camera.camera_id}: expected one of {wanted} without k4 to k6, found {model}")
+    values = np.zeros(9)
+    values[: len(places)] = given[list(places)]
+    values[2:4] -= HALF_PIXEL
+    intrinsics = np.array([[values[0], 0, values[2]], [0, values[1], values[3]], [0, 0, 1]])
+    return intrinsics, values[4:]
+
+
+def sensor(camera_id: int) -> Any:
+    """The sensor_t of a camera."""
+    pycolmap = import_pycolmap()
+    return pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id)
+
+
+def write_model(folder: str | Path, rig: Rig, *, text: bool = False) -> None:
+    """Write a rig as one COLMAP rig with one frame, whose images are called after the cameras: `NAME.png`.
+
+    The rig's own frame is the first camera.
+    """
+    pycolmap = import_pycolmap()
+    model = pycolmap.Reconstruction()
+    colmap_rig, frame = pycolmap.Rig(rig_id=1), pycolmap.Frame(frame_id=1, rig_id=1)
+    from_first = rig.T_camera_world @ np.linalg.inv(rig.T_camera_world[0])
+    images = []
+    for index, name in enumerate(rig.names):
+        camera_id = index + 1
+        model.add_camera(colmap_camera(camera_id, rig.intrinsics[index], rig.distortion[index], rig.image_sizes[index]))
+        if index == 0:
+            colmap_rig.add_ref_sensor(sensor(camera_id))
+        else:
+            colmap_rig.add_sensor(sensor(camera_id), pycolmap.Rigid3d(from_first[index, :3]))
+        frame.add_data_id(pycolmap.data_t(sensor(camera_id), camera_id))
+        image = pycolmap.Image(name=f"{name}.png", camera_id=camera_id, image_id=camera_id)
+        image.frame_id = 1
+        images.append(image)
+    frame.rig_from_world = pycolmap.Rigid3d(rig.T_camera_world[0, :3])
+    model.add_rig(colmap_rig)
+    model.add_frame(frame)
+    for image in images:
+        model.add_image(image)
+    model.register_frame(1)
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    (model.write_text if text else model.write)(folder)
+
+
+def read_model(folder: str | Path) -> Rig:
+    """Read the cameras of a COLMAP model, binary or text.
+
+    A model with a rig of several cameras gives these, placed as in its first frame. Without one, every image is a
+    camera. A camera is called after its image's file, or after its folder where a rig has many frames.
+
+    Raises:
+        InputError: not a model, no image in it, or a camera that OpenCV's five coefficients cannot describe.
+    """
+    folder = Path(folder)
+    suffixes = [s for s in (".bin", ".txt") if all((folder / f"{part}{s}").is_file() for part in PARTS[:2])]
+    if not suffixes:
+        raise InputError(f"{folder}: expected a COLMAP model (cameras and images, .bin or .txt), found none")
+    try:
+        model = import_pycolmap().Reconstruction(folder)
+    except (RuntimeError, ValueError, IndexError) as error:
+        raise InputError(f"{folder}: not a readable COLMAP model ({' '.join(str(error).split())})") from None
+    frames = [model.frames[frame_id] for frame_id in sorted(model.reg_frame_ids())]
+    if not frames:
+        raise InputError(f"{folder}: expected a model with images that have poses, found none")
+    widest = max(frames, key=lambda frame: len(list(frame.image_ids)))
+    moving = len(list(widest.image_ids)) > 1
+    chosen = [widest] if moving else frames
+    images = [model.images[data.id] for frame in chosen for data in sorted(frame.image_ids, key=lambda d: d.id)]
+    try:
+        lenses = [lens_of(model.cameras[image.camera_id]) for image in images]
+    except InputError as error:
+        raise InputError(f"{folder}: {error}") from None
+    cameras = [model.cameras[image.camera_id] for image in images]
+    transforms = np.tile(np.eye(4), (len(images), 1, 1))
+    transforms[:, :3] = [image.cam_from_world().matrix() for image in images]
+    return Rig(
+        names=_camera_names([image.name for image in images], by_folder=moving and len(frames) > 1),
+        intrinsics=np.stack([intrinsics for intrinsics, _ in lenses]),
+        distortion=np.stack([distortion for _, distortion in lenses]),
+        T_camera_world=transforms,
+        image_sizes=np.array([[camera.width, camera.height] for camera in cameras], np.int32),
+    )
+
+
+def _camera_names(images: list[str], *, by_folder: bool) -> tuple[str, ...]:
+    """File stems, or folders; the whole path without its ending where these are not unique."""
+    paths = [PurePosixPath(name.replace("\\", "/")) for name in images]
+    short = [path.parent.name if by_folder and path.parent.name else path.stem for path in paths]
+    unique = max(Counter(short).values()) == 1
+    return tuple(short if unique else [str(path.with_suffix("")) for path in paths])

@@ -1,0 +1,336 @@
+"""The capture folder: what a lab hands in, and what the synthetic scanner writes.
+
+    CAPTURE/
+      capture.json                    name, frame rate, paint colours
+      scans/000123.ply                one coloured mesh per frame (ply, glb or obj)
+      poses.npz body.npz              motion capture and the body it moves            [optional]
+      template.npz or template.obj    garment to register                             [optional]
+      rig.json                        cameras                                         [optional]
+      truth/model.npz truth/000123.npz    exact surfaces, from the synthetic scanner  [optional]
+
+docs/conventions.md describes every file, so that it can be written without this package.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+
+from capture4d.colours.spaces import Colour, format_colour, parse_colour
+from capture4d.errors import InputError
+from capture4d.files.atomic import file_digest, read_json, write_json
+from capture4d.files.meshes import MESH_SUFFIXES, read_coloured_mesh, read_mesh, write_mesh
+from capture4d.files.records import (
+    load_body,
+    load_garment,
+    load_poses,
+    load_rig,
+)
+from capture4d.geometry.mesh import boundary_loops
+from capture4d.types import Body, Garment, PoseSequence, Rig, Scan
+
+__all__ = [
+    "METRES",
+    "Capture",
+    "Units",
+    "body_digest",
+    "capture_digest",
+    "motion_digest",
+    "read_body",
+    "read_capture",
+    "read_poses",
+    "read_rig",
+    "read_scan",
+    "read_template",
+    "scan_digest",
+    "scan_path",
+    "template_digest",
+    "template_path",
+    "write_capture_description",
+    "write_scan",
+]
+
+_FORMAT = 1
+
+
+Units = Literal["m", "cm", "mm", "in"]
+
+
+METRES: dict[Units, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+"""Metres in a unit."""
+
+
+TEXTURE_SUFFIXES = (".mtl", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+"""What may lie beside the scans and colour them."""
+
+
+_END = 65_536
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Capture:
+    """A take: the description of a capture folder. Scans are read one by one, with `read_scan`."""
+
+    path: Path
+    name: str
+    fps: float
+    frame_ids: tuple[int, ...]
+    """The capture's own frame numbers, ascending."""
+    garment_colour: Colour | None
+    """None: to be learned from the scans."""
+    boundary_colours: Mapping[str, Colour] = field(default_factory=dict)
+    """Paint on each border loop; the same colour may serve several. Empty: no painted borders, or, where the garment's
+    colour is to be learned, those that are found."""
+    units: Units = "m"
+    """Of the scan files. What `read_scan` returns is in metres."""
+
+    def __post_init__(self) -> None:
+        if not self.frame_ids:
+            raise InputError(f"{self.path}: expected at least one frame, found none")
+        if not self.fps > 0:
+            raise InputError(f"{self.path}: expected a positive frame rate, found {self.fps}")
+        if list(self.frame_ids) != sorted(set(self.frame_ids)) or self.frame_ids[0] < 0:
+            raise InputError(f"{self.path}: expected ascending frame numbers, each once and none negative")
+
+    def time_s(self, frame_id: int) -> float:
+        """Time of a frame since the first."""
+        return (frame_id - self.frame_ids[0]) / self.fps
+
+
+# --- description and scans ---------------------------------------------------------------------------------------
+
+
+def _optional_colour(text: str | None) -> Colour | None:
+    return None if text is None else parse_colour(text)
+
+
+def _parse_units(text: str) -> Units:
+    for units in get_args(Units):
+        if text == units:
+            return units
+    raise InputError(f"expected units {', '.join(get_args(Units))}, found '{text}'")
+
+
+def read_capture(path: str | Path, *, scans: bool = True) -> Capture:
+    """Read `capture.json`, and see that every frame it names has a scan.
+
+    Args:
+        scans: False for a take that was simulated and never scanned.
+    Raises:
+        InputError: the folder, the description or a scan is missing, or the description is wrong.
+    """
+    path = Path(path)
+    description = path / "capture.json"
+    if not path.is_dir():
+        raise InputError(f"{path}: no such capture folder")
+    if not description.is_file():
+        raise InputError(f"{description}: no such file; a capture folder needs one (see docs/conventions.md)")
+    found = read_json(description)
+    present = _scan_numbers(path)
+    try:
+        if found.get("format") != _FORMAT:
+            raise InputError(f"expected format {_FORMAT}, found {found.get('format')}")
+        capture = Capture(
+            path=path,
+            name=str(found.get("name", path.resolve().name)),
+            fps=float(found["fps"]),
+            frame_ids=tuple(int(frame_id) for frame_id in found.get("frames") or sorted(present)),
+            garment_colour=_optional_colour(found.get("garment_colour")),
+            boundary_colours={name: parse_colour(text) for name, text in found.get("boundary_colours", {}).items()},
+            units=_parse_units(found.get("units", "m")),
+        )
+    except InputError as error:
+        raise InputError(f"{description}: {str(error).removeprefix(f'{path}: ')}") from None
+    except KeyError as error:
+        raise InputError(f"{description}: expected the entry {error}, found none") from None
+    except (AttributeError, TypeError, ValueError) as error:
+        raise InputError(f"{description}: {error}") from None
+    missing = [frame_id for frame_id in capture.frame_ids if frame_id not in present]
+    if scans and missing:
+        raise InputError(
+            f"{path / 'scans' / f'{missing[0]:06d}.ply'}: no such scan; {len(missing)} of "
+            f"{len(capture.frame_ids)} frames in capture.json have none"
+        )
+    return capture
+
+
+def write_capture_description(capture: Capture) -> None:
+    """Write `capture.json` into the capture's folder."""
+    write_json(
+        capture.path / "capture.json",
+        {
+            "format": _FORMAT,
+            "name": capture.name,
+            "fps": capture.fps,
+            "units": capture.units,
+            "garment_colour": None if capture.garment_colour is None else format_colour(capture.garment_colour),
+            "boundary_colours": {name: format_colour(colour) for name, colour in capture.boundary_colours.items()},
+            "frames": list(capture.frame_ids),
+        },
+    )
+
+
+def scan_path(capture: Capture, frame_id: int) -> Path:
+    """The file of a frame's scan.
+
+    Raises:
+        InputError: there is none.
+    """
+    for suffix in (".ply", ".glb", ".obj"):
+        path = capture.path / "scans" / f"{frame_id:06d}{suffix}"
+        if path.is_file():
+            return path
+    raise InputError(f"{capture.path / 'scans' / f'{frame_id:06d}.ply'}: no such scan")
+
+
+def read_scan(capture: Capture, frame_id: int) -> Scan:
+    """Read one frame, in metres.
+
+    Raises:
+        InputError: the scan is missing, damaged, or has neither vertex colours nor a texture.
+    """
+    path = scan_path(capture, frame_id)
+    found = read_coloured_mesh(path)
+    if found.colours is None:
+        raise InputError(f"{path}: expected a colour per vertex, found none, nor a texture")
+    mesh = found.mesh
+    if capture.units != "m":
+        mesh = mesh.with_vertices(mesh.vertices * np.float32(METRES[capture.units]))
+    return Scan(mesh, found.colours, frame_id, capture.time_s(frame_id))
+
+
+def write_scan(path: str | Path, scan: Scan) -> None:
+    write_mesh(path, scan.mesh, colours=scan.colours)
+
+
+def capture_digest(capture: Capture, *, instead: Mapping[int, str] | None = None) -> str:
+    """Digest of the description and the scans, which every stage starts from.
+
+    Args:
+        instead: digests of scans to count instead of those that are there now, by frame.
+    """
+    total = hashlib.sha256((capture.path / "capture.json").read_bytes())
+    for frame_id in capture.frame_ids:
+        digest = (instead or {}).get(frame_id) or scan_digest(scan_path(capture, frame_id))
+        total.update(f"{frame_id} {digest}\n".encode())
+    for path in sorted((capture.path / "scans").iterdir()):
+        if path.suffix.lower() in TEXTURE_SUFFIXES:
+            total.update(f"{path.name} {scan_digest(path)}\n".encode())
+    return total.hexdigest()
+
+
+def scan_digest(path: Path) -> str:
+    """Digest of a scan or its texture: name, size, first and last 64 kB, for takes are too large to be read twice."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        total = hashlib.sha256(f"{path.name} {size}\n".encode() + file.read(_END))
+        file.seek(max(size - _END, _END))
+        total.update(file.read(_END))
+    return total.hexdigest()
+
+
+def template_digest(capture: Capture) -> str:
+    """Digest of the template.
+
+    Raises:
+        InputError: there is none.
+    """
+    return file_digest([template_path(capture)], root=capture.path)
+
+
+def body_digest(capture: Capture) -> str | None:
+    """Digest of the body; None where the capture brings none."""
+    path = capture.path / "body.npz"
+    return file_digest([path], root=capture.path) if path.is_file() else None
+
+
+def motion_digest(capture: Capture) -> str | None:
+    """Digest of the poses and of the body they move; None where the capture brings no poses."""
+    if not (capture.path / "poses.npz").is_file():
+        return None
+    paths = [capture.path / name for name in ("poses.npz", "body.npz")]
+    return file_digest([path for path in paths if path.is_file()], root=capture.path)
+
+
+def _scan_numbers(path: Path) -> set[int]:
+    folder = path / "scans"
+    if not folder.is_dir():
+        return set()
+    return {int(file.stem) for file in folder.iterdir() if file.suffix in MESH_SUFFIXES and file.stem.isdecimal()}
+
+
+# --- what else a capture may hold --------------------------------------------------------------------------------
+
+
+def read_poses(capture: Capture) -> PoseSequence | None:
+    """The poses of the take, one per scan and in their order; None if the capture has none.
+
+    Raises:
+        InputError: a scan has no pose.
+    """
+    path = capture.path / "poses.npz"
+    if not path.is_file():
+        return None
+    poses = load_poses(path)
+    index = {int(frame_id): row for row, frame_id in enumerate(poses.frame_ids)}
+    missing = [frame_id for frame_id in capture.frame_ids if frame_id not in index]
+    if missing:
+        raise InputError(
+            f"{path}: expected a pose for each of {len(capture.frame_ids)} scans, "
+            f"found none for {len(missing)} of them, frame {missing[0]} first"
+        )
+    rows = [index[frame_id] for frame_id in capture.frame_ids]
+    return replace(
+        poses,
+        rotations=poses.rotations[rows],
+        translations=poses.translations[rows],
+        frame_ids=np.array(capture.frame_ids, np.int32),
+    )
+
+
+def read_body(capture: Capture) -> Body | None:
+    path = capture.path / "body.npz"
+    return load_body(path) if path.is_file() else None
+
+
+def read_rig(capture: Capture) -> Rig | None:
+    path = capture.path / "rig.json"
+    return load_rig(path) if path.is_file() else None
+
+
+def template_path(capture: Capture) -> Path:
+    """The file of the template.
+
+    Raises:
+        InputError: there is none.
+    """
+    for suffix in (".npz", *MESH_SUFFIXES):
+        path = capture.path / f"template{suffix}"
+        if path.is_file():
+            return path
+    raise InputError(
+        f"{capture.path / 'template.npz'}: no such file, nor a template.obj; registration needs a template"
+    )
+
+
+def read_template(capture: Capture) -> Garment:
+    """The garment to register: `template.npz`, or a bare mesh `template.obj` with loops called border_0, border_1, ...
+
+    Raises:
+        InputError: there is neither.
+    """
+    path = template_path(capture)
+    if path.suffix == ".npz":
+        return load_garment(path)
+    mesh = read_mesh(path).mesh
+    if capture.units != "m":
+        mesh = mesh.with_vertices(mesh.vertices * np.float32(METRES[capture.units]))
+    return Garment(mesh, {f"border_{index}": loop for index, loop in enumerate(boundary_loops(mesh.faces))})
+
+
+# --- truth -------------------------------------------------------------------------------------------------------

@@ -1,0 +1,51 @@
+"""The garment of one scan as a file: WORK/garment/frames/000123.npz."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from capture4d.errors import InputError
+from capture4d.files.atomic import write_npz
+from capture4d.types import GarmentScan, Mesh
+
+__all__ = ["load_garment_scan", "save_garment_scan"]
+
+
+def save_garment_scan(path: Path, scan: GarmentScan) -> None:
+    """Write one garment scan as npz, atomically."""
+    write_npz(
+        path,
+        vertices=scan.mesh.vertices,
+        faces=scan.mesh.faces,
+        boundary_points=scan.boundary_points,
+        boundary_loops=scan.boundary_loops,
+        loop_names=np.array(scan.loop_names, dtype=np.str_),
+    )
+
+
+def load_garment_scan(path: Path, frame_id: int) -> GarmentScan:
+    """Read a garment scan.
+
+    Raises:
+        InputError: the file is missing or damaged, or holds the reason why the frame has no garment.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            if "reason" in arrays:
+                raise InputError(str(arrays["reason"]))
+            return GarmentScan(
+                mesh=Mesh(arrays["vertices"], arrays["faces"]),
+                boundary_points=arrays["boundary_points"],
+                boundary_loops=arrays["boundary_loops"],
+                loop_names=tuple(str(name) for name in arrays["loop_names"]),
+                frame_id=frame_id,
+            )
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except (ValueError, KeyError, EOFError, OSError, zipfile.BadZipFile) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: not a readable garment scan, cut off or damaged ({error})") from None

@@ -1,0 +1,98 @@
+"""The exact state of a synthetic take, as it lies in CAPTURE/truth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, Int32, UInt8
+
+from capture4d.captures.capture import Capture
+from capture4d.files.arrays import ArrayFile, mesh_arrays
+from capture4d.files.atomic import write_npz
+from capture4d.types import Mesh
+
+__all__ = [
+    "TruthFrame",
+    "TruthModel",
+    "read_truth_frame",
+    "read_truth_model",
+    "read_truth_vertices",
+    "write_truth_frame",
+    "write_truth_model",
+]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TruthModel:
+    """What the synthetic scanner knows about a take."""
+
+    fine: Mesh
+    """The simulated garment in its rest state; its faces and UVs hold for every frame."""
+    loops: Mapping[str, Int32[np.ndarray, " loop"]]
+    """Border loops of `fine`."""
+    template_faces: Int32[np.ndarray, " verts"]
+    """Material map: the face of `fine` each vertex of the registration template lies on, ..."""
+    template_barycentric: Float32[np.ndarray, "verts 3"]
+    """... and where in it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TruthFrame:
+    """The exact state of one synthetic frame."""
+
+    vertices: Float32[np.ndarray, "fine 3"]
+    """Of `TruthModel.fine`, metres."""
+    rotations: Float32[np.ndarray, "joints 3 3"]
+    translation: Float32[np.ndarray, " 3"]
+    labels: UInt8[np.ndarray, " scan"]
+    """Per scan vertex: 0 body, 1 garment, 2 painted border."""
+
+
+def write_truth_model(path: str | Path, model: TruthModel) -> None:
+    write_npz(
+        path,
+        **mesh_arrays("fine_", model.fine),
+        **{f"loop_{name}": loop for name, loop in model.loops.items()},
+        template_faces=model.template_faces,
+        template_barycentric=model.template_barycentric,
+    )
+
+
+def read_truth_model(capture: Capture) -> TruthModel | None:
+    path = capture.path / "truth" / "model.npz"
+    if not path.is_file():
+        return None
+    with ArrayFile(path) as arrays:
+        return TruthModel(
+            fine=arrays.mesh("fine_"),
+            loops=arrays.prefixed("loop_"),
+            template_faces=arrays["template_faces"],
+            template_barycentric=arrays["template_barycentric"],
+        )
+
+
+def write_truth_frame(path: str | Path, frame: TruthFrame) -> None:
+    write_npz(
+        path,
+        vertices=frame.vertices,
+        rotations=frame.rotations,
+        translation=frame.translation,
+        labels=frame.labels,
+    )
+
+
+def read_truth_frame(capture: Capture, frame_id: int) -> TruthFrame:
+    with ArrayFile(_truth_path(capture, frame_id)) as arrays:
+        return TruthFrame(arrays["vertices"], arrays["rotations"], arrays["translation"], arrays["labels"])
+
+
+def read_truth_vertices(capture: Capture, frame_id: int) -> Float32[np.ndarray, "fine 3"]:
+    with ArrayFile(_truth_path(capture, frame_id)) as arrays:
+        return arrays["vertices"]
+
+
+def _truth_path(capture: Capture, frame_id: int) -> Path:
+    return capture.path / "truth" / f"{frame_id:06d}.npz"

@@ -1,0 +1,1 @@
+"""What colours tell: light, materials, and which vertex is garment, paint or the rest."""

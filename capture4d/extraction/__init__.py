@@ -1,0 +1,1 @@
+"""Coloured scans in, the garment of each and the points on its painted borders out."""

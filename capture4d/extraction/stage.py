@@ -1,0 +1,157 @@
+"""The stage that cuts the garment out of every scan: CAPTURE in, WORK/garment out.
+
+Colours that capture.json does not give are learned from a few scans first, and written to colours.json. All must be in
+the first frame that can be read, or else capture.json is wrong. A later frame that lacks them, because the subject has
+left the volume or hides a border, and any frame whose scan is damaged, gets the reason instead of a garment, and
+registration flags it. Damaged scans are read again in every run, in case they were repaired; other scans must not have
+changed.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from capture4d.captures.capture import Capture, capture_digest, read_capture, read_scan, scan_digest, scan_path
+from capture4d.captures.garment_scans import save_garment_scan
+from capture4d.captures.take_colours import KnownColours, forget_learned_colours, take_colours, template_loops
+from capture4d.colours.spaces import format_colour
+from capture4d.errors import InputError
+from capture4d.extraction.garment import ColourNotFoundError, cut_out
+from capture4d.files.arrays import ArrayFile
+from capture4d.files.atomic import write_json, write_npz
+from capture4d.runs.stage import Stage, open_stage
+from capture4d.runs.workers import run_jobs
+from capture4d.types import GarmentScan
+
+__all__ = ["flagged_frames", "run"]
+
+SCHEMA = 4
+
+
+@dataclass(frozen=True, slots=True)
+class ExtractionSettings:
+    """What decides the result, besides the capture."""
+
+    schema: int = SCHEMA
+    learn_colours: bool = False
+
+
+def run(capture: Path, output: Path, *, learn_colours: bool = False, workers: int = 1, overwrite: bool = False) -> str:
+    """Extract the garment of every frame that has none yet; the digest of the result.
+
+    Args:
+        learn_colours: learn all colours from the scans, not only those that capture.json leaves open.
+    Raises:
+        InputError: a scan is missing, none can be read, or the first that can lacks the garment's colours; or these are
+            to be learned and are not separable.
+    """
+    description = read_capture(capture)
+    named = {}
+    if not description.boundary_colours and (learn_colours or description.garment_colour is None):
+        named["loops"] = " ".join(template_loops(description))
+    before = _unreadable_scans(output, description.frame_ids)
+    stage = open_stage(
+        output,
+        name="extract",
+        schema=SCHEMA,
+        config=ExtractionSettings(learn_colours=learn_colours),
+        upstream={"capture": capture_digest(description), **named},
+        sources={"capture": capture},
+        formerly={"capture": capture_digest(description, instead=before), **named} if before else None,
+        overwrite=overwrite,
+    )
+    forget_learned_colours()
+    colours_path = stage.path / "colours.json"
+    pending = sorted({*stage.pending(description.frame_ids), *before})
+    if pending or not colours_path.is_file():
+        colours = take_colours(description, learn=learn_colours)
+        write_json(colours_path, _described(colours))
+        done = _extract_first(description, colours, stage, pending)
+        jobs = [(frame_id, stage.frame_path(frame_id)) for frame_id in pending if frame_id != done]
+        for _ in run_jobs(partial(write_frame, description, colours), jobs, workers=workers, label="extract garment"):
+            pass
+    frames = [stage.frame_path(frame_id) for frame_id in description.frame_ids]
+    return stage.finish([colours_path, *frames], changed=bool(pending))
+
+
+def flagged_frames(folder: Path) -> dict[int, str]:
+    """Frames of an extraction without a garment, and why, in ascending order."""
+    reasons = {int(path.stem): _reason(path) for path in sorted((folder / "frames").glob("*.npz"))}
+    return {frame_id: reason for frame_id, reason in reasons.items() if reason}
+
+
+def _unreadable_scans(folder: Path, frame_ids: Sequence[int]) -> dict[int, str]:
+    """Frames whose scan an earlier run could not read, and what that scan's digest was."""
+    found = {}
+    for frame_id in frame_ids:
+        path = folder / "frames" / f"{frame_id:06d}.npz"
+        if zipfile.is_zipfile(path):
+            with ArrayFile(path) as arrays:
+                digest = arrays.get("scan")
+            if digest is not None:
+                found[frame_id] = str(digest)
+    return found
+
+
+def _reason(path: Path) -> str:
+    """Why a frame has no garment, nothing if it has one."""
+    with ArrayFile(path) as arrays:
+        reason = arrays.get("reason")
+        return "" if reason is None else str(reason)
+
+
+def _extract_first(capture: Capture, colours: KnownColours, stage: Stage, pending: Sequence[int]) -> int | None:
+    """Extract the first frame that can be read, if that is not done, to see that the colours are right.
+
+    Returns:
+        The frame; None if it was done before.
+    Raises:
+        ColourNotFoundError: the garment or a paint is not in it.
+        InputError: no frame can be read; about the first.
+    """
+    faults = []
+    for frame_id in capture.frame_ids:
+        if frame_id not in pending:
+            return None
+        try:
+            found = extract_frame(capture, colours, frame_id)
+        except ColourNotFoundError:
+            raise
+        except InputError as error:
+            faults.append(error)
+            continue
+        save_garment_scan(stage.frame_path(frame_id), found)
+        return frame_id
+    raise faults[0]
+
+
+def _described(colours: KnownColours) -> dict[str, Any]:
+    return {
+        "learned": colours.light is not None,
+        "garment_colour": format_colour(colours.garment),
+        "boundary_colours": {name: format_colour(colour) for name, colour in colours.boundary.items()},
+        "other_colours": [format_colour(colour) for colour in colours.others],
+    }
+
+
+def extract_frame(capture: Capture, colours: KnownColours, frame_id: int) -> GarmentScan:
+    """Read one scan and cut its garment out."""
+    return cut_out(read_scan(capture, frame_id), colours, source=str(scan_path(capture, frame_id)))
+
+
+def write_frame(capture: Capture, colours: KnownColours, job: tuple[int, Path]) -> None:
+    """Extract one frame and write it, or the reason why there is nothing to write."""
+    frame_id, path = job
+    try:
+        save_garment_scan(path, extract_frame(capture, colours, frame_id))
+    except InputError as error:
+        damaged = not isinstance(error, ColourNotFoundError)
+        source = {"scan": np.array(scan_digest(scan_path(capture, frame_id)))} if damaged else {}
+        write_npz(path, reason=np.array(str(error)), **source)

@@ -1,0 +1,1 @@
+"""One value, one file: meshes, arrays, records. Whole or not there at all; errors name the file and the line."""

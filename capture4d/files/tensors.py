@@ -1,0 +1,86 @@
+"""Arrays and a JSON note in one safetensors file: written whole or not at all, read without running code."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors
+import safetensors.numpy
+
+from capture4d.errors import InputError
+from capture4d.files.atomic import write_bytes
+
+__all__ = ["TensorFile", "read_tensors", "write_tensors"]
+
+_NOTE = "capture4d"
+_PICKLE_STARTS = (b"\x80", b"PK\x03\x04")
+"""A bare pickle, and the zip that torch.save writes."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TensorFile:
+    """What a file held."""
+
+    path: Path
+    tensors: Mapping[str, np.ndarray]
+    note: Mapping[str, Any]
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        if name not in self.tensors:
+            raise InputError(f"{self.path}: expected a tensor '{name}', found {', '.join(self.tensors) or 'none'}")
+        return self.tensors[name]
+
+    def get(self, name: str) -> np.ndarray | None:
+        return self[name] if name in self.tensors else None
+
+    def prefixed(self, prefix: str) -> dict[str, np.ndarray]:
+        """The tensors whose names begin so, without the beginning."""
+        return {name.removeprefix(prefix): each for name, each in self.tensors.items() if name.startswith(prefix)}
+
+    def entry(self, name: str) -> Any:
+        """An entry of the note."""
+        if name not in self.note:
+            raise InputError(f"{self.path}: expected '{name}' in its note, found {', '.join(self.note) or 'none'}")
+        return self.note[name]
+
+
+def write_tensors(path: str | Path, kind: str, tensors: Mapping[str, np.ndarray], note: Mapping[str, Any]) -> None:
+    """Write arrays with a note, atomically. Equal arrays give equal bytes.
+
+    Args:
+        kind: what the file is, checked when it is read.
+        note: whatever JSON holds.
+    """
+    text = json.dumps({"kind": kind, **note}, sort_keys=True, allow_nan=False)
+    plain = {name: np.asarray(array, order="C") for name, array in tensors.items()}
+    write_bytes(path, safetensors.numpy.save(plain, metadata={_NOTE: text}))
+
+
+def read_tensors(path: str | Path, kind: str) -> TensorFile:
+    """Read a file that `write_tensors` wrote.
+
+    Raises:
+        InputError: it is missing, cut off, a pickle or another kind of file.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    try:
+        with safetensors.safe_open(path, framework="numpy") as file:
+            note = json.loads((file.metadata() or {}).get(_NOTE, "{}"))
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+    except (safetensors.SafetensorError, json.JSONDecodeError) as error:
+        with path.open("rb") as stream:
+            start = stream.read(4)
+        if start.startswith(_PICKLE_STARTS):  # a header of 128 bytes begins like a pickle, but it can be read
+            message = "expected a safetensors file, found a pickle or an archive, which is not opened"
+            raise InputError(f"{path}: {message}") from None
+        raise InputError(f"{path}: not a readable safetensors file, cut off or damaged ({error})") from None
+    if note.get("kind") != kind:
+        raise InputError(f"{path}: expected {kind}, found {note.get('kind') or 'a file of somebody else'}")
+    return TensorFile(path, tensors, note)

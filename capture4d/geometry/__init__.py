@@ -1,0 +1,1 @@
+"""Triangle meshes as arrays: normals, edges, borders, nearest points, UVs."""

@@ -1,0 +1,59 @@
+"""Import open3d, warp and pycolmap where they are needed: quietly, and so that they load at all."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import functools
+import importlib
+import os
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+__all__ = ["import_open3d", "import_pycolmap", "import_warp"]
+
+
+@functools.cache
+def import_open3d() -> Any:
+    """The open3d module. Slow (about 1.5 s), so call it inside the function that needs it."""
+    if sys.platform == "linux":
+        try:
+            ctypes.CDLL("libusb-1.0.so.0")
+        except OSError:
+            package = importlib.import_module("libusb_package")
+            ctypes.CDLL(str(package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
+    return importlib.import_module("open3d")
+
+
+@functools.cache
+def import_pycolmap() -> Any:
+    """The pycolmap module."""
+    importlib.import_module("cv2")
+    return importlib.import_module("pycolmap")
+
+
+@functools.cache
+def import_warp() -> Any:
+    """The warp module, initialised. To be called before anything that imports warp itself (newton, anny)."""
+    with _native_stderr_closed():  # on a machine without CUDA its library prints a warning that nothing switches off
+        import warp
+
+        warp.config.log_level = warp.LOG_ERROR  # or it prints each device and each compiled module
+        warp.init()
+    return warp
+
+
+@contextlib.contextmanager
+def _native_stderr_closed() -> Iterator[None]:
+    """Drop what native code writes to stderr meanwhile; Python's own exceptions pass."""
+    sys.stderr.flush()
+    saved = os.dup(2)
+    sink = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(sink, 2)
+        yield
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)
+        os.close(sink)

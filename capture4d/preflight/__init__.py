@@ -1,0 +1,1 @@
+"""What is wrong with a take, before a night is spent on it."""

@@ -1,0 +1,228 @@
+"""A take as it lies in a folder, before anything about it is believed: which file is which frame, what is said of it.
+
+`capture4d.captures.capture.read_capture` refuses a folder with a fault; here faults are what is looked for.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from capture4d.body.anny import load_anny
+from capture4d.body.posed_surface import BodyState, TrackedBody, tracked_body
+from capture4d.body.skinning import ShapedBody, pose_frame, with_shape
+from capture4d.captures.capture import METRES
+from capture4d.colours.spaces import parse_colour
+from capture4d.errors import EmptyMeshError, InputError, NotFiniteError
+from capture4d.files.atomic import read_json
+from capture4d.files.meshes import MESH_SUFFIXES, read_coloured_mesh
+from capture4d.files.polygons import MeshFile
+from capture4d.files.records import load_body, load_poses, load_rig
+from capture4d.preflight.statistics import Paints
+from capture4d.preflight.verdict import BadFrame, TakeFacts
+from capture4d.types import PoseSequence, Rig
+
+__all__ = ["Claims", "TakeFolder", "body_state", "open_take", "posed_body", "read_frame", "time_stamp", "tracked_model"]
+
+_STAMP = re.compile(rb"^\s*(?:comment|obj_info|#)\s+time(?:[_ ]?stamp)?\s*[:=]?\s+([-+.\deE]+)\s*(?:s|sec)?\s*$", re.M)
+
+
+@dataclass(frozen=True, slots=True)
+class Claims:
+    """What the caller says of a take, over what its folder says."""
+
+    frames: str | None = None
+    """File name of a frame, `{frame}` in place of its number."""
+    fps: float | None = None
+    units: str | None = None
+    garment_colour: str | None = None
+    border_colours: tuple[str, ...] = ()
+    rig: Path | None = None
+    poses: Path | None = None
+    body: Path | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TakeFolder:
+    """Files of a take."""
+
+    path: Path
+    files: Mapping[int, Path]
+    """One scan per frame number, ascending."""
+    also: Mapping[int, tuple[Path, ...]]
+    """Further files with a number that has one already."""
+    description: Mapping[str, Any]
+    """capture.json, or nothing."""
+    facts: TakeFacts
+    rig: Rig | None
+    poses_path: Path | None
+    body_path: Path | None
+    """None with `moving`: the built-in body."""
+    moving: bool
+    """There are poses, of a body that is known."""
+    claims: Claims
+
+
+def open_take(path: Path, claims: Claims | None = None) -> TakeFolder:
+    """Find the frames of a take, and what is said of them.
+
+    Raises:
+        InputError: no such folder, no scans in it, a pattern without {frame}, or a description that cannot be read.
+    """
+    claims = claims or Claims()
+    if not path.is_dir():
+        raise InputError(f"{path}: expected a capture folder or a folder of scans, found {_kind(path)}")
+    described = path / "capture.json"
+    description = read_json(described) if described.is_file() else {}
+    if not isinstance(description, dict):
+        raise InputError(f"{described}: expected a JSON object, found {type(description).__name__}")
+    folder = path / "scans" if (path / "scans").is_dir() else path
+    found = _numbered_files(folder, claims.frames)
+    if not found:
+        wanted = claims.frames or f"files with a frame number ({', '.join(MESH_SUFFIXES)})"
+        raise InputError(f"{folder}: expected scans named {wanted}, found none")
+    files = {number: names[0] for number, names in sorted(found.items())}
+    poses_path, body_path = (
+        given or (path / name if (path / name).is_file() else None)
+        for given, name in ((claims.poses, "poses.npz"), (claims.body, "body.npz"))
+    )
+    rig_path = claims.rig or (path / "rig.json" if (path / "rig.json").is_file() else None)
+    rig = load_rig(rig_path) if rig_path else None
+    poses = load_poses(poses_path) if poses_path else None
+    try:
+        facts = _facts(description, claims, tuple(files), poses)
+    except InputError as error:
+        raise InputError(f"{described}: {error}") from None
+    except (AttributeError, TypeError, ValueError) as error:
+        raise InputError(f"{described}: {error}") from None
+    also = {number: tuple(names[1:]) for number, names in sorted(found.items()) if len(names) > 1}
+    facts = replace(facts, duplicated=tuple(also))
+    moving = poses is not None and (body_path is not None or poses.joint_names == load_anny().joint_names)
+    return TakeFolder(path, files, also, description, facts, rig, poses_path, body_path, moving, claims)
+
+
+def _kind(path: Path) -> str:
+    return "a file" if path.exists() else "nothing"
+
+
+def _numbered_files(folder: Path, pattern: str | None) -> dict[int, list[Path]]:
+    if pattern is not None and pattern.count("{frame}") != 1:
+        raise InputError(f"--frames: expected a file name with {{frame}} in it once, found '{pattern}'")
+    if pattern is not None:
+        before, after = (re.escape(part) for part in pattern.split("{frame}"))
+        named = re.compile(f"{before}(\\d+){after}")
+    else:
+        named = re.compile(r".*?(\d+)\D*")
+    files: dict[int, list[Path]] = {}
+    for file in sorted(folder.iterdir()):
+        if file.suffix.lower() not in MESH_SUFFIXES or not file.is_file() or file.stem.startswith("template"):
+            continue
+        match = named.fullmatch(file.name if pattern is not None else file.stem)
+        if match:
+            files.setdefault(int(match[1]), []).append(file)
+    return files
+
+
+def _facts(
+    description: Mapping[str, Any],
+    claims: Claims,
+    frame_ids: tuple[int, ...],
+    poses: PoseSequence | None,
+) -> TakeFacts:
+    units = claims.units or description.get("units", "m")
+    declared = next((metres for name, metres in METRES.items() if name == units), None)
+    if declared is None:
+        raise InputError(f"units: expected one of {', '.join(METRES)}, found '{units}'")
+    fps = claims.fps if claims.fps is not None else description.get("fps")
+    if fps is not None and not float(fps) > 0:
+        raise InputError(f"fps: expected a positive frame rate, found {fps}")
+    garment = claims.garment_colour or description.get("garment_colour")
+    borders: dict[str, list[str]] = {}
+    if claims.border_colours:
+        borders = {colour: [colour] for colour in claims.border_colours}
+    else:
+        for name, colour in description.get("boundary_colours", {}).items():
+            borders.setdefault(colour, []).append(name)
+    listed = description.get("frames")
+    return TakeFacts(
+        fps=None if fps is None else float(fps),
+        declared=declared,
+        paints=Paints(parse_colour(garment) if garment else None, tuple(parse_colour(colour) for colour in borders)),
+        border_names=tuple(tuple(names) for names in borders.values()),
+        frame_ids=frame_ids,
+        listed=tuple(int(number) for number in listed) if listed else None,
+        dropped=tuple(int(number) for number in description.get("dropped_frames", ())),
+        pose_frames=None if poses is None else tuple(int(number) for number in poses.frame_ids),
+        pose_fps=None if poses is None else poses.fps,
+    )
+
+
+def read_frame(path: Path, frame_id: int) -> MeshFile | BadFrame:
+    """The scan in a file, or what is wrong with it."""
+    if path.stat().st_size == 0:
+        return BadFrame(frame_id, "frame-empty", f"{path}: an empty file")
+    try:
+        found = read_coloured_mesh(path)
+    except EmptyMeshError as error:
+        return BadFrame(frame_id, "frame-empty", str(error))
+    except NotFiniteError as error:
+        return BadFrame(frame_id, "frame-nan", str(error))
+    except InputError as error:
+        return BadFrame(frame_id, "frame-unreadable", str(error))
+    corners = found.mesh.vertices[found.mesh.faces]
+    if not np.any(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])):
+        return BadFrame(frame_id, "frame-empty", f"{path}: all faces are without area")
+    return found
+
+
+def time_stamp(path: Path) -> float | None:
+    """Seconds, from a comment such as `comment timestamp 12.345` in the head of a ply or obj file."""
+    with path.open("rb") as file:
+        match = _STAMP.search(file.read(2048))
+    try:
+        return float(match[1]) if match else None
+    except ValueError:  # a date, say
+        return None
+
+
+def posed_body(poses_path: Path, body_path: Path | None, frame_id: int) -> np.ndarray | None:
+    """Body surface of a frame, (V, 3), metres; None without a pose for it.
+
+    Args:
+        body_path: None is the built-in body.
+    Raises:
+        InputError: body and poses do not belong together.
+    """
+    shaped, poses, rows = _motion(poses_path, body_path)
+    return pose_frame(shaped, poses, rows[frame_id]).vertices() if frame_id in rows else None
+
+
+def body_state(poses_path: Path, body_path: Path | None, frame_id: int) -> BodyState | None:
+    """Pose and shape of a frame; None without a pose for it."""
+    shaped, poses, rows = _motion(poses_path, body_path)
+    if frame_id not in rows:
+        return None
+    shape = np.zeros(len(shaped.body.shape_directions))
+    shape[: len(shaped.shape)] = shaped.shape
+    row = rows[frame_id]
+    return BodyState(poses.rotations[row].astype(np.float64), poses.translations[row].astype(np.float64), shape)
+
+
+def tracked_model(poses_path: Path, body_path: Path | None) -> TrackedBody:
+    """The body of the motion capture, as tracking has it."""
+    return tracked_body(_motion(poses_path, body_path)[0].body)
+
+
+@lru_cache(maxsize=1)
+def _motion(poses_path: Path, body_path: Path | None) -> tuple[ShapedBody, PoseSequence, dict[int, int]]:
+    body, poses = load_body(body_path) if body_path else load_anny(), load_poses(poses_path)
+    if body.joint_names != poses.joint_names:
+        name = body_path.name if body_path else "the built-in body"
+        raise InputError(f"{poses_path}: expected the joints of {name}, found others")
+    return with_shape(body, poses.shape), poses, {int(number): row for row, number in enumerate(poses.frame_ids)}

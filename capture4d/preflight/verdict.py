@@ -1,0 +1,485 @@
+"""What is wrong with a take, and what to do about it: numbers of its frames in, findings out.
+
+Every check gives a score, what was measured over what is tolerated: above 1 it is a finding. A finding names a cause
+once; what merely follows from it (no garment colour in a scan without colours) is not reported again. docs/preflight.md
+describes every finding, and where its limit comes from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal, get_args
+
+import numpy as np
+
+from capture4d.captures.capture import METRES
+from capture4d.colours.spaces import colour_angles, to_lab
+from capture4d.preflight.statistics import FrameStatistics, Paints
+from capture4d.preflight.survey import MAX_FLOOR_M, MAX_SIZE_RATIO, Survey
+
+__all__ = ["CODES", "BadFrame", "Code", "Finding", "Limits", "Severity", "TakeFacts", "Verdict", "judge", "true_rate"]
+
+Severity = Literal["error", "warning"]
+Code = Literal[
+    "units",
+    "axes",
+    "mirrored",
+    "winding",
+    "floor",
+    "frame-unreadable",
+    "frame-empty",
+    "frame-nan",
+    "frame-partial",
+    "frame-repeated",
+    "frames-missing",
+    "frames-duplicated",
+    "fps",
+    "colours-missing",
+    "colours-washed-out",
+    "garment-absent",
+    "border-absent",
+    "border-not-separable",
+    "border-on-body",
+    "outside-volume",
+    "noise",
+    "holes",
+    "scale-jump",
+    "poses-missing",
+    "poses-mismatch",
+]
+CODES: tuple[Code, ...] = get_args(Code)
+
+ADVICE: Mapping[Code, tuple[Severity, str]] = {
+    "units": ("error", "set units in capture.json, or export in metres; --fix rewrites the scans in metres"),
+    "axes": ("error", "export with Y up; --fix turns the scans"),
+    "mirrored": ("error", "look for a left-handed axis convention in the export; --fix mirrors the scans back"),
+    "winding": ("error", "reverse the faces on export; --fix does. If text reads backwards, the take is mirrored"),
+    "floor": ("warning", "put the floor at y = 0; --fix shifts scans and poses where the feet or motion capture tell"),
+    "frame-unreadable": ("error", "copy or reconstruct these frames again; --fix leaves them out"),
+    "frame-empty": ("error", "reconstruct these frames again; --fix leaves them out"),
+    "frame-nan": ("error", "reconstruct these frames again; --fix leaves them out"),
+    "frame-partial": ("warning", "look at these frames: cameras may have dropped out; --fix leaves them out"),
+    "frame-repeated": ("warning", "the recorder stalled; --fix leaves the copies out"),
+    "frames-missing": ("warning", "find the frames, or accept the gap, as --fix does; times follow from frame numbers"),
+    "frames-duplicated": (
+        "error",
+        "keep one file per frame number; --fix drops equal copies, and both of unequal ones",
+    ),
+    "fps": ("warning", "correct fps in capture.json; --fix does where files or motion capture tell the rate"),
+    "colours-missing": ("error", "export with vertex colours, or with UVs and a texture beside the mesh"),
+    "colours-washed-out": ("error", "check exposure, white balance and the colour space of the export"),
+    "garment-absent": ("error", "measure the garment's colour in a scan and correct garment_colour in capture.json"),
+    "border-absent": ("error", "paint the border, or correct boundary_colours in capture.json"),
+    "border-not-separable": ("error", "paint the border in a hue far from the garment's and the other paints'"),
+    "border-on-body": ("warning", "use a paint that neither skin, hair nor suit has, or change the suit"),
+    "outside-volume": ("warning", "move the subject or the rig, or leave these frames out"),
+    "noise": ("warning", "check calibration and focus; smooth the scans before registration"),
+    "holes": ("warning", "check light and camera coverage; registration bridges holes but cannot see in them"),
+    "scale-jump": ("error", "reconstruct these frames with the others' calibration; --fix leaves them out"),
+    "poses-missing": ("warning", "export the motion capture of all frames; --fix leaves the scans without a pose out"),
+    "poses-mismatch": ("error", "check that poses.npz and body.npz are of this subject, take and time"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What is tolerated. The strongest score of a sound take is 0.79 (`python -m benchmarks preflight --quick`)."""
+
+    floor_rough_m: float = 0.35
+    """Where neither feet nor motion capture tell the floor."""
+    partial_area: float = 0.8
+    """Least share of the take's typical surface size (square root of the area)."""
+    scale_step: float = 0.04
+    """Change of size that surface and spacing share."""
+    noise: float = 0.12
+    """Distance to the plane of the neighbours, spacings."""
+    hole_share: float = 0.35
+    fps_range: tuple[float, float] = (5.0, 1000.0)
+    fastest_m_s: float = 3.0
+    """Speed across the surface that a twentieth of a person exceeds."""
+    slowest_m_s: float = 0.06
+    """Nobody who moves at all moves slower than this all the time."""
+    moved_m: float = 0.15
+    """Who has moved less than this stood still."""
+    fps_mismatch: float = 1.05
+    """Factor between the capture's frame rate and that of motion capture or time stamps."""
+    chroma_share: float = 0.5
+    """Least share of the garment's chroma that the scans must show."""
+    chroma: float = 10.0
+    """Least chroma of the most colourful hundredth, where the garment's colour is not known; skin has 20."""
+    clipped_share: float = 0.25
+    garment_share: float = 0.02
+    border_share: float = 0.002
+    """Least share of a paint relative to the garment."""
+    paint_angle: float = 0.36
+    """Radians in linear RGB; the extraction takes 0.24 for one colour."""
+    stray_share: float = 0.15
+    """Largest share of a paint that lies away from the cloth."""
+    cameras_lost: float = 0.12
+    """Share of the views that a frame may lose against the take's best frames."""
+    cameras_least: float = 0.5
+    """Least share of the views that a frame has against the middle of the rig."""
+    left_m: float = 0.25
+    """Walked this far while the surface shrinks: left the volume, where no rig tells."""
+    pose_distance_m: float = 0.02
+    pose_distance_dressed_m: float = 0.04
+    """The same where cloth cannot be told from the body."""
+
+
+@dataclass(frozen=True, slots=True)
+class BadFrame:
+    """A frame that cannot be looked at."""
+
+    frame_id: int
+    code: Literal["frame-unreadable", "frame-empty", "frame-nan"]
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TakeFacts:
+    """What a take says about itself, and what its file names say."""
+
+    fps: float | None
+    declared: float
+    """Metres in a unit of the scan files."""
+    paints: Paints = field(default_factory=Paints)
+    border_names: tuple[tuple[str, ...], ...] = ()
+    """Names of the borders of each paint."""
+    frame_ids: tuple[int, ...] = ()
+    """All frame numbers with a file, ascending."""
+    listed: tuple[int, ...] | None = None
+    """Frames that the description names."""
+    dropped: tuple[int, ...] = ()
+    """Frames that the description says were left out."""
+    duplicated: tuple[int, ...] = ()
+    """Frame numbers with more than one file."""
+    pose_frames: tuple[int, ...] | None = None
+    pose_fps: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that is wrong."""
+
+    code: Code
+    found: str
+    """What was measured, for people."""
+    score: float
+    """Measured over tolerated."""
+    frames: tuple[int, ...] = ()
+    """Where; empty for the whole take."""
+
+    @property
+    def severity(self) -> Severity:
+        return ADVICE[self.code][0]
+
+    @property
+    def advice(self) -> str:
+        return ADVICE[self.code][1]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Verdict:
+    findings: tuple[Finding, ...]
+    """Errors first, in the order of `CODES`."""
+    scores: Mapping[Code, float]
+    """Of everything that was checked, findings or not."""
+
+
+def judge(
+    facts: TakeFacts,
+    survey: Survey | None,
+    frames: Sequence[FrameStatistics],
+    bad_frames: Sequence[BadFrame] = (),
+    *,
+    limits: Limits | None = None,
+) -> Verdict:
+    """Findings of a take.
+
+    Args:
+        survey: of its coordinates; None if no frame could be read.
+        frames: what was looked at, in metres, Y up.
+    """
+    limits = limits or Limits()
+    frames = sorted(frames, key=lambda frame: frame.frame_id)
+    checks = [*_check_bad(bad_frames), *_check_numbers(facts)]
+    if survey is not None:
+        checks += _check_survey(survey, facts, limits)
+    if frames:
+        checks += _check_rate(facts, frames, limits)
+        checks += _check_surface(facts, frames, limits)
+        checks += _check_colours(facts, frames, limits)
+        checks += _check_poses(facts, survey, frames, limits)
+    scores: dict[Code, float] = {}
+    for check in checks:
+        scores[check.code] = max(scores.get(check.code, 0.0), check.score)
+    found = [check for check in checks if check.score > 1]
+    order = {code: index for index, code in enumerate(CODES)}
+    found.sort(key=lambda finding: (finding.severity != "error", order[finding.code]))
+    return Verdict(tuple(found), scores)
+
+
+# --- frames and numbers ------------------------------------------------------------------------------------------
+
+
+def _check_bad(bad_frames: Sequence[BadFrame]) -> Iterator[Finding]:
+    for code in ("frame-unreadable", "frame-empty", "frame-nan"):
+        bad = sorted((bad for bad in bad_frames if bad.code == code), key=lambda bad: bad.frame_id)
+        if bad:
+            yield Finding(code, f"{_count(bad)}, first: {bad[0].reason}", _CERTAIN, tuple(b.frame_id for b in bad))
+        else:
+            yield Finding(code, "none", 0.0)
+
+
+_CERTAIN = 10.0
+"""Score of what is a fact, not a measurement; others are cut off here."""
+
+
+def _check_numbers(facts: TakeFacts) -> Iterator[Finding]:
+    present = np.array(facts.frame_ids, np.int64)
+    absent = set(facts.listed or ()) - set(facts.frame_ids)
+    if len(present) > 2:
+        steps = np.diff(present)
+        step = int(np.bincount(steps).argmax()) if steps.max() < 1_000_000 else int(np.median(steps))
+        regular = {
+            int(start) + step * (number + 1)
+            for start, gap in zip(present, steps, strict=False)
+            if gap > step and gap % step == 0 and gap // step < 10_000
+            for number in range(gap // step - 1)
+        }
+        # Irregular numbers are a hand-picked selection; regular ones with gaps are not.
+        if (steps == step).mean() >= 0.5:
+            absent |= regular
+    absent -= set(facts.dropped)
+    if absent:
+        yield Finding("frames-missing", f"{_count(absent)} of {len(present) + len(absent)}", _CERTAIN, _sorted(absent))
+    else:
+        yield Finding("frames-missing", "none", 0.0)
+    if facts.duplicated:
+        many = f"{_count(facts.duplicated)} with more than one file"
+        yield Finding("frames-duplicated", many, _CERTAIN, facts.duplicated)
+    else:
+        yield Finding("frames-duplicated", "none", 0.0)
+    unposed = set() if facts.pose_frames is None else set(facts.listed or facts.frame_ids) - set(facts.pose_frames)
+    if unposed:
+        yield Finding("poses-missing", f"no pose for {_count(unposed)}", _CERTAIN, _sorted(unposed))
+    else:
+        yield Finding("poses-missing", "none", 0.0)
+
+
+# --- coordinates -------------------------------------------------------------------------------------------------
+
+
+def _check_survey(survey: Survey, facts: TakeFacts, limits: Limits) -> Iterator[Finding]:
+    declared = next((name for name, metres in METRES.items() if metres == facts.declared), "?")
+    unit = f"a person in {survey.units}" if survey.units else "in no known unit a person"
+    yield Finding(
+        "units",
+        f"subject {survey.size_ratio:.3g} times too large or small in {declared}, {unit}",
+        _capped(np.log(survey.size_ratio) / np.log(MAX_SIZE_RATIO)),
+    )
+    told = "motion capture" if survey.by_poses else "the figure"
+    placement = survey.placement
+    turned = not placement.mirrors and bool((placement.axes != np.eye(3)).any())
+    yield Finding(
+        "axes",
+        f"up is {_axis_name(placement.axes[1])} by {told}, which fits {survey.axes_ratio:.2g} times better so",
+        _capped(survey.axes_ratio) if turned else min(survey.axes_ratio, 1.0),
+    )
+    if survey.mirror_ratio is not None:
+        yield Finding(
+            "mirrored",
+            f"mirrored, the scans fit motion capture {survey.mirror_ratio:.2g} times better",
+            _capped(survey.mirror_ratio) if placement.mirrors else min(survey.mirror_ratio, 1.0),
+        )
+    inside_out = survey.outwardness < 0 and not placement.mirrors
+    yield Finding(
+        "winding",
+        f"faces look inwards (outwardness {survey.outwardness:.2f})",
+        _capped(-survey.outwardness / 0.08) if inside_out else 0.0,
+    )
+    limit = MAX_FLOOR_M if survey.floor_exact else limits.floor_rough_m
+    sure = "" if survey.floor_exact else "about "
+    yield Finding("floor", f"floor at y = {sure}{survey.floor_m:.2f} m", _capped(abs(survey.floor_m) / limit))
+
+
+def _axis_name(row: np.ndarray) -> str:
+    axis = int(np.abs(row).argmax())
+    return f"{'-' if row[axis] < 0 else '+'}{'XYZ'[axis]}"
+
+
+# --- rate --------------------------------------------------------------------------------------------------------
+
+
+def _check_rate(facts: TakeFacts, frames: Sequence[FrameStatistics], limits: Limits) -> Iterator[Finding]:
+    if facts.fps is None:
+        return
+    low, high = limits.fps_range
+    checks = [(facts.fps / high, f"{facts.fps:g} frames a second"), (low / facts.fps, f"{facts.fps:g} frames a second")]
+    rate = true_rate(facts, frames)
+    if rate is not None:
+        factor = max(rate / facts.fps, facts.fps / rate)
+        text = f"{facts.fps:g} frames a second, but motion capture or time stamps say {rate:.4g}"
+        checks.append((np.log(factor) / np.log(limits.fps_mismatch), text))
+    speeds = [
+        frame.shift_m * facts.fps / (frame.frame_id - frame.shift_from)
+        for frame in frames
+        if frame.shift_m is not None and frame.shift_from is not None
+    ]
+    if len(speeds) >= 2:
+        fast = float(np.percentile(speeds, 90))
+        checks.append((fast / limits.fastest_m_s, f"at {facts.fps:g} frames a second limbs move at {fast:.2g} m/s"))
+        box = np.array([[*frame.lower, *frame.upper] for frame in frames])
+        if np.ptp(box, axis=0).max() > limits.moved_m:
+            text = f"at {facts.fps:g} frames a second nothing moves faster than {max(speeds):.2g} m/s"
+            checks.append((limits.slowest_m_s / max(max(speeds), 1e-9), text))
+    score, text = max(checks)
+    yield Finding("fps", text, _capped(score))
+
+
+def true_rate(facts: TakeFacts, frames: Sequence[FrameStatistics]) -> float | None:
+    """Frames a second by time stamps in the files, or by motion capture; None if neither tells."""
+    stamped = [(frame.frame_id, frame.time_s) for frame in frames if frame.time_s is not None]
+    if len(stamped) >= 3:
+        numbers, times = np.array(stamped, float).T
+        ratio = np.median(np.diff(times) / np.diff(numbers))
+        if ratio > 0:
+            return float(1 / ratio)
+    return facts.pose_fps
+
+
+# --- surface -----------------------------------------------------------------------------------------------------
+
+
+def _check_surface(facts: TakeFacts, frames: Sequence[FrameStatistics], limits: Limits) -> Iterator[Finding]:
+    ids = np.array([frame.frame_id for frame in frames])
+    size = np.sqrt([frame.area_m2 for frame in frames])
+    spacing = np.array([frame.spacing_m for frame in frames])
+    usual = np.median(size[size >= 0.9 * np.percentile(size, 75)])
+    outside = _outside(frames, size / usual, limits)
+    yield _per_frame("outside-volume", ids, outside, "the garment leaves the volume")
+    inside = outside <= 1
+    partial = np.where(inside, np.log(size / usual) / np.log(limits.partial_area), 0)
+    yield _per_frame("frame-partial", ids, partial, "much less surface than usual")
+    steps = np.log(np.stack([size / np.median(size), spacing / np.median(spacing)]))
+    common = np.where(np.sign(steps[0]) == np.sign(steps[1]), np.abs(steps).min(axis=0), 0)
+    jump = np.where(inside, common, 0) / limits.scale_step
+    yield _per_frame("scale-jump", ids, jump, f"{100 * np.expm1(common.max()):.0f} % larger or smaller than the rest")
+    noise = np.array([frame.noise for frame in frames])
+    yield _per_frame("noise", ids, noise / limits.noise, f"noise of {noise.max():.2g} vertex spacings")
+    holes = np.where(inside, [frame.hole_share for frame in frames], 0)
+    yield _per_frame(
+        "holes", ids, holes / limits.hole_share, f"holes of up to {100 * holes.max():.0f} % of the surface"
+    )
+    first: dict[str, int] = {}
+    copies = [frame.frame_id for frame in frames if first.setdefault(frame.content, frame.frame_id) != frame.frame_id]
+    yield Finding(
+        "frame-repeated", f"{_count(copies)} the same as an earlier one", _CERTAIN * bool(copies), _sorted(copies)
+    )
+
+
+def _outside(frames: Sequence[FrameStatistics], size: np.ndarray, limits: Limits) -> np.ndarray:
+    """Score of every frame for leaving the volume, (T,)."""
+    if all(frame.camera_share is not None for frame in frames):
+        share = np.array([frame.camera_share for frame in frames], float)
+        lost = 1 - share / max(np.percentile(share, 90), 1e-9)
+        beside = share / np.maximum([frame.best_share or 0.0 for frame in frames], 1e-3)
+        return np.maximum(lost / limits.cameras_lost, limits.cameras_least / np.maximum(beside, 1e-3))
+    centre = np.array([frame.centre for frame in frames])[:, [0, 2]]
+    whole = size >= 0.95
+    away = np.linalg.norm(centre - np.median(centre[whole], axis=0), axis=1) if whole.any() else np.zeros(len(size))
+    shrunk = np.log(np.minimum(size, 1)) / np.log(limits.partial_area)
+    return np.minimum(away / limits.left_m, shrunk)
+
+
+def _per_frame(code: Code, ids: np.ndarray, scores: np.ndarray, text: str) -> Finding:
+    bad = tuple(int(number) for number in ids[scores > 1])
+    return Finding(code, f"{text}, in {_count(bad)} of {len(ids)}", _capped(float(scores.max())), bad)
+
+
+# --- colours -----------------------------------------------------------------------------------------------------
+
+
+def _check_colours(facts: TakeFacts, frames: Sequence[FrameStatistics], limits: Limits) -> Iterator[Finding]:
+    coloured = [frame.colours for frame in frames if frame.colours is not None]
+    bare = [frame.frame_id for frame in frames if frame.colours is None]
+    yield Finding(
+        "colours-missing", f"no colours in {_count(bare)} of {len(frames)}", _CERTAIN * bool(bare), _sorted(bare)
+    )
+    if not coloured:
+        return
+    chroma = float(np.median([colours.chroma for colours in coloured]))
+    faded = limits.chroma / max(chroma, 1e-3)
+    text = f"chroma of {chroma:.3g}"
+    garment = facts.paints.garment
+    if garment is not None:
+        wanted = float(np.hypot(*to_lab(np.array([garment], np.uint8))[0, 1:]))
+        shown = [colours.garment_chroma for colours in coloured if np.isfinite(colours.garment_chroma)]
+        if wanted > 15 and shown:
+            faded = limits.chroma_share * wanted / max(float(np.median(shown)), 1e-3)
+            text = f"the garment's chroma is {np.median(shown):.3g} instead of {wanted:.3g}"
+        elif wanted <= 15:  # grey cloth on a grey suit has no colour to lose
+            faded = 0.0
+    clipped = float(np.median([colours.clipped for colours in coloured])) / limits.clipped_share
+    if clipped > faded:
+        text = f"{100 * clipped * limits.clipped_share:.0f} % of the surface is overexposed"
+    yield Finding("colours-washed-out", text, _capped(max(faded, clipped)))
+    if garment is None or max(faded, clipped) > 1:
+        return
+    cloth = float(np.median([colours.garment for colours in coloured]))
+    absent = limits.garment_share / max(cloth, 1e-6)
+    yield Finding("garment-absent", f"{100 * cloth:.2g} % of the surface has the garment's colour", _capped(absent))
+    if absent > 1:
+        return
+    spreads = [colours.garment_spread for colours in coloured if np.isfinite(colours.garment_spread)]
+    spread = float(np.median(spreads)) if spreads else 0.0
+    for index, paint in enumerate(facts.paints.borders):
+        names = ", ".join(facts.border_names[index]) if index < len(facts.border_names) else f"paint {index + 1}"
+        others = np.array([garment, *facts.paints.borders[:index]], np.uint8)
+        angle = float(colour_angles(others, paint).min())
+        close = max(limits.paint_angle, 2 * spread) / max(angle, 1e-3)
+        yield Finding(
+            "border-not-separable", f"{names}: {angle:.2f} rad from another paint or the cloth", _capped(close)
+        )
+        if close > 1:
+            continue
+        share = float(np.median([colours.borders[index] for colours in coloured])) / cloth
+        absent = limits.border_share / max(share, 1e-6)
+        yield Finding("border-absent", f"{names}: {100 * share:.2g} % as much as cloth", _capped(absent))
+        if absent <= 1:
+            stray = float(np.median([colours.stray[index] for colours in coloured]))
+            text = f"{names}: {100 * stray:.0f} % of its colour is away from the cloth"
+            yield Finding("border-on-body", text, _capped(stray / limits.stray_share))
+
+
+# --- poses -------------------------------------------------------------------------------------------------------
+
+
+def _check_poses(
+    facts: TakeFacts, survey: Survey | None, frames: Sequence[FrameStatistics], limits: Limits
+) -> Iterator[Finding]:
+    if survey is not None and survey.person_ratio is not None:
+        text = f"the body in the scans differs from that of the motion capture by {1e3 * survey.person_m:.0f} mm"
+        yield Finding("poses-mismatch", text, _capped(survey.person_ratio))
+    measured = [frame for frame in frames if frame.pose_distance_m is not None]
+    if not measured:
+        return
+    distance = np.array([frame.pose_distance_m for frame in measured], float)
+    told = [frame.colours is not None and 0.02 < frame.colours.garment < 0.85 for frame in measured]
+    limit = np.where(told, limits.pose_distance_m, limits.pose_distance_dressed_m)
+    ids = np.array([frame.frame_id for frame in measured])
+    text = f"scans up to {1e3 * distance.max():.0f} mm from the posed body"
+    yield _per_frame("poses-mismatch", ids, distance / limit, text)
+
+
+def _count(items: Sequence | set) -> str:
+    return f"{len(items)} frame{'' if len(items) == 1 else 's'}"
+
+
+def _sorted(items: Sequence[int] | set[int]) -> tuple[int, ...]:
+    return tuple(sorted(int(item) for item in items))
+
+
+def _capped(score: float) -> float:
+    return float(np.clip(score, 0.0, _CERTAIN))

@@ -1,0 +1,208 @@
+"""Stages that survive a crash: folders that resume, and refuse to go on with other settings.
+
+A stage is a folder with a `stage.json` and one file per frame. A file either exists whole or does not exist, so the
+work that is left after a crash is the files that are missing, and the same command finishes it with the same result.
+A stage remembers its settings and the digests of what it was made from, and refuses to continue with others.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import zipfile
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from capture4d.errors import InputError, StaleError
+from capture4d.files.atomic import TEMPORARY_SUFFIX, file_digest, plain_value, read_json, write_json
+
+__all__ = ["Stage", "open_stage", "require_complete"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stage:
+    """An open output folder. Made by `open_stage`, closed by `finish`."""
+
+    path: Path
+    _record: dict[str, Any]
+    _earlier: dict[str, Any] | None = None
+    """Record of the run before, if that was complete."""
+
+    @property
+    def was_complete(self) -> bool:
+        """An earlier run with these settings and inputs has finished."""
+        return self._earlier is not None
+
+    @property
+    def frames_folder(self) -> Path:
+        return self.path / "frames"
+
+    def frame_path(self, frame_id: int, suffix: str = ".npz", *, folder: str = "frames") -> Path:
+        """Where a frame's file goes: `<stage>/<folder>/000123<suffix>`."""
+        return self.path / folder / f"{frame_id:06d}{suffix}"
+
+    def pending(self, frame_ids: Iterable[int], suffix: str = ".npz", *, folder: str = "frames") -> list[int]:
+        """The frames that have no valid file yet, in the order given."""
+        return [frame_id for frame_id in frame_ids if not _is_whole(self.frame_path(frame_id, suffix, folder=folder))]
+
+    def count(self, suffix: str = ".npz", *, folder: str = "frames") -> int:
+        """How many frames have a file, whole or not: cheap enough to be asked every second."""
+        try:
+            with os.scandir(self.path / folder) as entries:
+                return sum(entry.name.endswith(suffix) and not entry.name.startswith(".") for entry in entries)
+        except FileNotFoundError:
+            return 0
+
+    def finish(self, paths: Iterable[Path], *, changed: bool = True) -> str:
+        """Mark the stage complete and return its digest, over the names and contents of `paths`.
+
+        Leave out of `paths` what differs between equal runs, such as times.
+
+        Args:
+            changed: False if nothing was written since the stage was opened: if it was complete then, its digest is
+                not computed again.
+        """
+        paths = list(paths)
+        if self._earlier is not None and not changed and all(path.is_file() for path in paths):
+            write_json(self.path / "stage.json", {**self._earlier, "sources": self._record["sources"]})
+            return self._earlier["digest"]
+        for leftover in self.path.rglob(f".*{TEMPORARY_SUFFIX}"):
+            leftover.unlink(missing_ok=True)
+        digest = file_digest(paths, root=self.path)
+        finished = {**self._record, "status": "complete", "digest": digest, "finished": _now()}
+        write_json(self.path / "stage.json", finished)
+        return digest
+
+
+def open_stage(
+    folder: str | Path,
+    *,
+    name: str,
+    schema: int,
+    config: Any,
+    upstream: Mapping[str, str],
+    sources: Mapping[str, Path] | None = None,
+    formerly: Mapping[str, str] | None = None,
+    overwrite: bool = False,
+) -> Stage:
+    """Open an output folder, new or to be continued.
+
+    Args:
+        name: of the stage, as in "registration".
+        schema: number of the output's format; a change makes old output unusable.
+        config: frozen dataclass of everything that decides the result (so not the number of workers).
+        upstream: digest of each input, by name.
+        sources: where the inputs lie, for later stages and for people. Inputs may be moved, so this decides nothing.
+        formerly: an earlier `upstream` whose results still hold; a folder that was made from it is taken over.
+        overwrite: start clean; deletes everything in the folder, if it is this stage's.
+    Raises:
+        InputError: the folder holds something else.
+        StaleError: it holds this stage, made with other settings or from other inputs.
+    """
+    folder = Path(folder)
+    record_path = folder / "stage.json"
+    settings = {
+        "stage": name,
+        "schema": schema,
+        "config": json.loads(json.dumps(config, default=plain_value)),
+        "upstream": dict(upstream),
+    }
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: expected a folder to write to, found a file")
+    existing = read_json(record_path) if record_path.exists() else None
+    if existing is None and folder.is_dir() and not _is_blank(folder):
+        raise InputError(f"{folder}: expected an empty folder or an earlier run of '{name}', found other files")
+    if existing is not None and existing.get("stage") != name:
+        raise InputError(f"{folder}: expected output of '{name}', found output of '{existing.get('stage')}'")
+
+    if existing is not None and (overwrite or existing.get("status") == "discarded"):
+        _discard(folder, existing)
+        existing = None
+    if existing is not None and formerly not in (None, upstream) and existing.get("upstream") == formerly:
+        existing = {**existing, "upstream": settings["upstream"], "status": "taken over"}
+    if existing is not None:
+        changed = list(_differences(settings, existing))
+        if changed:
+            raise StaleError(f"{folder}: was made with other settings ({'; '.join(changed[:3])}); use --overwrite")
+        started = existing.get("started", _now())
+    else:
+        started = _now()
+    places = {name: str(path.resolve()) for name, path in (sources or {}).items()}
+    record = {**settings, "sources": places, "status": "running", "started": started}
+    if existing is None or existing.get("status") != "running":
+        write_json(record_path, record)
+    return Stage(folder, record, existing if existing and existing.get("status") == "complete" else None)
+
+
+def require_complete(folder: str | Path, name: str, command: str, *, made_from: Mapping[str, str] | None = None) -> str:
+    """The digest of a finished stage.
+
+    Args:
+        made_from: digests of inputs that it has to have been made from, by name.
+    Raises:
+        InputError: it is missing or unfinished; the message names `command`, which repairs that.
+        StaleError: it was made from something else.
+    """
+    folder = Path(folder)
+    if not (folder / "stage.json").is_file():
+        raise InputError(f"{folder}: expected the output of '{name}', found none; run: {command}")
+    record = read_json(folder / "stage.json")
+    if record.get("stage") != name:
+        raise InputError(f"{folder}: expected the output of '{name}', found output of '{record.get('stage')}'")
+    if record.get("status") != "complete":
+        raise InputError(f"{folder}: '{name}' is not finished; run: {command}")
+    for key, digest in (made_from or {}).items():
+        if record.get("upstream", {}).get(key) != digest:
+            raise StaleError(
+                f"{folder}: expected the output of '{name}' from this {key} as it is now, found that of another or of "
+                f"an earlier state; run: {command} --overwrite"
+            )
+    return record["digest"]
+
+
+def _differences(now: Any, before: Any, prefix: str = "") -> Iterator[str]:
+    for key in now:
+        label = f"{prefix}{key}"
+        new, old = now[key], before.get(key) if isinstance(before, dict) else None
+        if isinstance(new, dict) and isinstance(old, dict):
+            yield from _differences({**dict.fromkeys(old), **new}, old, f"{label}.")
+        elif new != old:
+            yield f"{label}: was {_short(old)}, now {_short(new)}"
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 40 else f"{text[:36]}..."
+
+
+def _is_blank(folder: Path) -> bool:
+    """Nothing in it but folders and the temporary files of a run that was killed before its first file."""
+    return not any(path.is_file() and path.suffix != TEMPORARY_SUFFIX for path in folder.rglob("*"))
+
+
+def _discard(folder: Path, record: dict[str, Any]) -> None:
+    """Empty a stage folder; if that is interrupted, the record left behind says to go on."""
+    write_json(folder / "stage.json", {**record, "status": "discarded"})
+    for path in folder.iterdir():
+        if path.name == "stage.json":
+            continue
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
+
+
+def _is_whole(path: Path) -> bool:
+    """Atomic writes make existing files whole; this also catches what a lost disk or a careless copy cut off."""
+    try:
+        return zipfile.is_zipfile(path) if path.suffix == ".npz" else path.stat().st_size > 0
+    except OSError:
+        return False
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")

@@ -1,0 +1,214 @@
+"""A template for registration from any garment mesh that lies on a body, or from a part of the body itself.
+
+What registration needs beside the mesh: the rest pose, skin weights and the body point under every vertex, border loops
+in order and by name, UVs that can be used. Loops are named by the part of the body they go around.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int32
+
+from capture4d.body.binding import WEIGHT_SMOOTHING, diffuse
+from capture4d.body.posed_surface import PosedSurface, match, tracked_body
+from capture4d.body.skinning import PosedBody, unskin
+from capture4d.errors import InputError
+from capture4d.geometry.mesh import boundary_loops, vertex_normals
+from capture4d.geometry.uv_atlas import UvReport, check_uv, fresh_uv
+from capture4d.types import Body, Garment, Mesh
+
+__all__ = ["TemplateReport", "UvChoice", "make_template", "name_loops", "weld"]
+
+UvChoice = Literal["auto", "keep", "fresh", "none"]
+FAR_M = 0.25
+"""A garment whose vertices lie farther than this from the body, in the median, is not on it."""
+LEAST_SIZE_M = 0.05
+"""A smaller mesh is no garment in these units, though it may lie near a foot."""
+NORMAL_WEIGHT = 4.0
+"""How much more facing counts than in tracking: loose cloth hangs centimetres away from its limb."""
+ARM = r"upperarm|lowerarm|wrist|elbow|_shoulder|_hand"
+LEG = r"upperleg|lowerleg|foot|knee|ankle|_hip"
+NECK = r"neck|head"
+
+
+@dataclass(frozen=True, slots=True)
+class TemplateReport:
+    """What was found, and done."""
+
+    vertices: int
+    faces: int
+    distance_m: float
+    """Of the vertices from the body, median."""
+    uv: UvReport
+    """Of the mesh as it came."""
+    fresh_uv: bool
+
+
+def make_template(
+    mesh: Mesh, body: PosedBody, *, uv: UvChoice = "auto", names: Sequence[str] = (), source: str = "mesh"
+) -> tuple[Garment, TemplateReport]:
+    """Bind a mesh to the body it lies on, and take it to the rest pose.
+
+    Args:
+        mesh: metres, in the world of the posed body.
+        uv: keep the mesh's, cut `fresh` ones, have `none`; `auto` keeps them if nothing is wrong with them.
+        names: of the loops, the one with the most vertices first; found by position if empty.
+        source: what errors call the mesh.
+    Raises:
+        InputError: the mesh cannot be a template; says what was expected.
+    """
+    _require_surface(mesh, source)
+    size = float(np.ptp(mesh.vertices, axis=0).max())
+    if size < LEAST_SIZE_M:
+        raise InputError(f"{source}: expected a garment, found a mesh of {1e3 * size:.2g} mm; its units differ")
+    at, barycentric, weights, nearest = _bind(mesh, body)
+    distance = float(np.median(np.linalg.norm(mesh.vertices - nearest, axis=1)))
+    if distance > FAR_M:
+        raise InputError(
+            f"{source}: expected a garment on the body, found it {1e3 * distance:.0f} mm off in the median; "
+            "its units, its place or the pose differ"
+        )
+    rest, flagged = unskin(mesh.vertices, weights, body.transforms)
+    if flagged.any():
+        raise InputError(f"{source}: expected a pose that can be undone, found {flagged.sum()} vertices between limbs")
+    loops = boundary_loops(mesh.faces)
+    found = check_uv(mesh)
+    kept, fresh = _choose_uv(mesh, found, uv, source)
+    garment = Garment(
+        template=Mesh(rest.astype(np.float32), mesh.faces, kept),
+        loops=dict(zip(_loop_names(loops, names, weights, rest, body.shaped.body, source), loops, strict=True)),
+        embedding_faces=at,
+        embedding_barycentric=barycentric,
+        skin_weights=weights,
+        body_shape=np.asarray(body.shaped.shape, np.float32),
+    )
+    return garment, TemplateReport(len(mesh.vertices), len(mesh.faces), distance, found, fresh)
+
+
+def _bind(mesh: Mesh, body: PosedBody) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Body faces and barycentrics, skin weights, and the body points themselves.
+
+    Only body points that face the same way count as near: the inside of a sleeve hangs nearer to the trunk than to the
+    arm. Which way the garment faces is what most of it agrees on with the body.
+    """
+    model = tracked_body(body.shaped.body)
+    faces, skin = body.shaped.body.template.faces, body.vertices()
+    surface = PosedSurface(model, body, skin, vertex_normals(skin, faces))
+    vertices = mesh.vertices.astype(np.float64)
+    normals = vertex_normals(vertices, mesh.faces)
+    plain = match(surface, vertices, np.zeros_like(normals))
+    if np.einsum("va,va->v", plain.normals, normals).sum() < 0:
+        normals = -normals
+    matches = match(surface, vertices, NORMAL_WEIGHT * normals)
+    weights = np.einsum("vk,vkj->vj", matches.barycentric, body.shaped.body.skin_weights[faces[matches.faces]])
+    weights = diffuse(weights, mesh.faces, WEIGHT_SMOOTHING)
+    weights = (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
+    return matches.faces, matches.barycentric.astype(np.float32), weights, matches.points
+
+
+def weld(mesh: Mesh) -> Mesh:
+    """Join vertices in the same place, which glb files split at UV seams; the first of each keeps its turn."""
+    _, first, inverse = np.unique(mesh.vertices, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    renumbered = np.empty(len(first), np.int32)
+    renumbered[order] = np.arange(len(first), dtype=np.int32)
+    return Mesh(mesh.vertices[first[order]], renumbered[inverse.reshape(-1)][mesh.faces], mesh.uv)
+
+
+def _require_surface(mesh: Mesh, source: str) -> None:
+    edges = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    if (edges[:, 0] == edges[:, 1]).any():
+        bad = int(np.flatnonzero((np.diff(np.sort(mesh.faces, axis=1), axis=1) == 0).any(axis=1))[0])
+        raise InputError(f"{source}: expected three different corners in every face, face {bad} uses one twice")
+    _, uses = np.unique(edges, axis=0, return_counts=True)
+    if (uses > 2).any():
+        count = int((uses > 2).sum())
+        raise InputError(f"{source}: expected at most two faces at an edge, found more at {count} of {len(uses)} edges")
+    unused = len(mesh.vertices) - len(np.unique(mesh.faces))
+    if unused:
+        raise InputError(f"{source}: expected every vertex in a face, found {unused} in none")
+    if not (uses == 1).any():
+        raise InputError(f"{source}: expected a garment with open borders, found a closed surface")
+    if _has_mixed_winding(mesh):
+        raise InputError(f"{source}: expected faces wound alike, found neighbours wound against each other")
+
+
+def _has_mixed_winding(mesh: Mesh) -> bool:
+    directed = mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    return len(np.unique(directed, axis=0)) < len(directed)
+
+
+def _choose_uv(mesh: Mesh, found: UvReport, choice: UvChoice, source: str) -> tuple[np.ndarray | None, bool]:
+    faults = found.faults()
+    if choice == "none":
+        return None, False
+    if choice == "keep" and faults:
+        raise InputError(f"{source}: expected UVs that can be kept, found {', '.join(faults)}")
+    if choice == "fresh" or faults:
+        return fresh_uv(mesh), True
+    return mesh.uv, False
+
+
+def _loop_names(
+    loops: list[np.ndarray], names: Sequence[str], weights: np.ndarray, rest: np.ndarray, body: Body, source: str
+) -> tuple[str, ...]:
+    if not names:
+        return name_loops(loops, weights, rest, body)
+    if len(names) != len(loops) or len(set(names)) != len(names):
+        sizes = ", ".join(str(len(loop)) for loop in loops)
+        raise InputError(f"{source}: expected {len(loops)} different names for loops of {sizes} vertices, "
+                         f"found {len(names)}")  # fmt: skip
+    return tuple(names)
+
+
+def name_loops(
+    loops: Sequence[Int32[np.ndarray, " _"]],
+    weights: Float32[np.ndarray, "verts joints"],
+    rest: Float64[np.ndarray, "verts 3"],
+    body: Body,
+) -> tuple[str, ...]:
+    """neck, hem, cuff_left and cuff_right of a shirt; waist, leg_left and leg_right of trousers.
+
+    A loop goes around what moves it most. What is on the trunk is the hem at the bottom, the neck on top; of a garment
+    with legs it is the waist. Several of one kind are counted.
+    """
+    kinds = []
+    for loop in loops:
+        share = weights[loop].mean(axis=0)
+        parts = {part: _share(share, body, pattern) for part, pattern in (("arm", ARM), ("leg", LEG), ("neck", NECK))}
+        parts["trunk"] = 1.0 - sum(parts.values())
+        part = max(parts, key=lambda each: parts[each])
+        x = float(rest[loop, 0].mean())
+        around = abs(x) < 0.25 * float(np.ptp(rest[loop, 0]))
+        kinds.append((part if part != "leg" or not around else "trunk", "left" if x > 0 else "right"))
+    has_legs = any(part == "leg" for part, _ in kinds)
+    trunk = [i for i, (part, _) in enumerate(kinds) if part == "trunk"]
+    has_neck = any(part == "neck" for part, _ in kinds)
+    highest = max(trunk, key=lambda i: rest[loops[i], 1].mean()) if len(trunk) > 1 and not has_neck else None
+    names = []
+    for index, (part, side) in enumerate(kinds):
+        if part == "arm":
+            names.append(f"cuff_{side}")
+        elif part == "leg":
+            names.append(f"leg_{side}")
+        elif part == "neck" or index == highest:
+            names.append("neck")
+        else:
+            names.append("waist" if has_legs else "hem")
+    seen: Counter[str] = Counter()
+    counted = []
+    for name in names:
+        seen[name] += 1
+        counted.append(name if seen[name] == 1 else f"{name}_{seen[name]}")
+    return tuple(counted)
+
+
+def _share(weights: np.ndarray, body: Body, pattern: str) -> float:
+    named = [bool(re.search(pattern, name)) for name in body.joint_names]
+    return float(weights[named].sum())

@@ -1,0 +1,1 @@
+"""Sewing patterns, and cloth simulated from them."""

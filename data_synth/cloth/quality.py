@@ -1,0 +1,64 @@
+"""Is a simulated frame fit to be ground truth? Measures, and the reasons to flag a frame.
+
+References: area limits as Jin et al. prune their samples, appendix (below 25 % or above 200 % of the rest area).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from capture4d.geometry.mesh import face_areas
+from capture4d.heavy_imports import import_open3d
+from data_synth.cloth.patterns import PanelMesh
+from data_synth.cloth.wrinkle_relaxation import WrinkleMesh
+
+__all__ = ["ClothQuality", "measure_cloth"]
+
+AREA_LIMITS = (0.25, 2.0)
+STRETCH_LIMIT = 1.2
+INSIDE_LIMIT_PERCENT = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class ClothQuality:
+    """One frame of simulated cloth."""
+
+    stretch_p1: float
+    stretch_p99: float
+    """Edge length over rest length, percentiles."""
+    crushed_faces: int
+    overstretched_faces: int
+    """Faces outside `AREA_LIMITS`."""
+    inside_body_percent: float
+    """Vertices inside the body."""
+    deepest_mm: float
+    """The deepest of them."""
+    reasons: tuple[str, ...]
+    """Why the frame should not be trusted; empty for a good one."""
+
+
+def measure_cloth(
+    mesh: PanelMesh, wrinkles: WrinkleMesh, vertices: np.ndarray, surface: np.ndarray, body_faces: np.ndarray
+) -> ClothQuality:
+    """Measure a fine frame, (V, 3) metres, against its pattern and the body surface, (B, 3)."""
+    ends = vertices[wrinkles.edges]
+    stretch = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / wrinkles.rest_lengths
+    first, second = mesh.uv[:, 1] - mesh.uv[:, 0], mesh.uv[:, 2] - mesh.uv[:, 0]
+    rest_area = 0.5 * np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
+    area = face_areas(vertices.astype(np.float64), mesh.faces) / rest_area
+    scene = import_open3d().t.geometry.RaycastingScene(nthreads=1)
+    scene.add_triangles(surface.astype(np.float32), body_faces.astype(np.uint32))
+    depth = -scene.compute_signed_distance(vertices.astype(np.float32)).numpy()
+    p1, p99 = np.percentile(stretch, [1, 99])
+    crushed, over = int((area < AREA_LIMITS[0]).sum()), int((area > AREA_LIMITS[1]).sum())
+    inside = 100 * float((depth > 0).mean())
+    reasons = []
+    if p99 > STRETCH_LIMIT:
+        reasons.append(f"stretched: 99 % of edges within {p99:.2f} of their length")
+    if inside > INSIDE_LIMIT_PERCENT:
+        reasons.append(f"{inside:.2f} % of the vertices inside the body")
+    if crushed + over > 0.001 * len(area):
+        reasons.append(f"{crushed} faces crushed and {over} overstretched")
+    return ClothQuality(float(p1), float(p99), crushed, over, inside, 1e3 * float(max(depth.max(), 0)), tuple(reasons))

@@ -1,0 +1,337 @@
+"""Fine folds on a coarse cloth: lift a dense mesh onto the coarse sheet and relax it at its true rest lengths.
+
+The coarse sheet was simulated on a shrunk pattern, so the lifted dense mesh is compressed. Relaxation lets it buckle:
+isometric bending, a foundation that holds it to the sheet (weakly along the normal), the body as half planes, and
+inextensible edges. The folds start from one fixed imperfection of the cloth blended with the folds of the frame
+before, so they follow the pose and hardly the history.
+
+Letters: V fine vertices, C coarse vertices, E edges, Q inner edges (hinges). Metres, world frame.
+
+References: isometric bending, Bergou et al., A Quadratic Bending Model for Inextensible Surfaces (SGP 2006); the
+position-based projections, Mueller et al. (2007); wrinkle meshes, Mueller and Chentanez (SCA 2010); Phong tessellation,
+Boubekeur and Alexa (2008).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from capture4d.geometry.mesh import unique_edges, vertex_adjacency, vertex_normals
+from capture4d.heavy_imports import import_open3d
+from data_synth.cloth.patterns import PanelMesh, locate, smooth_noise
+from data_synth.config import Fabric, RelaxationConfig
+
+__all__ = ["BodyPlanes", "WrinkleMesh", "body_planes", "relax_frame", "wrinkle_mesh"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WrinkleMesh:
+    """All that relaxation needs and that no frame changes."""
+
+    faces: np.ndarray
+    """(F, 3) int32 of the fine mesh."""
+    coarse_faces: np.ndarray
+    """(G, 3) int32 of the coarse mesh."""
+    lift_vertices: np.ndarray
+    """(V, 3) coarse vertices around each fine vertex."""
+    lift_weights: np.ndarray
+    """(V, 3) their barycentric weights."""
+    tangent_edges: np.ndarray
+    """(V, 2) a fine edge from each vertex, whose direction carries offsets from frame to frame."""
+    edges: np.ndarray
+    """(E, 2) int32."""
+    rest_lengths: np.ndarray
+    """(E,) float32, metres on the pattern."""
+    hinges: np.ndarray
+    """(Q, 4) int32: the ends of an inner edge, then the vertices opposite."""
+    hinge_weights: np.ndarray
+    """(Q, 5) float32: the bending stencil, and one over its squared norm."""
+    imperfection: np.ndarray
+    """(V,) float32 offset along the normal from which folds start, metres."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BodyPlanes:
+    """The body near each fine vertex, as a half plane."""
+
+    points: np.ndarray
+    """(V, 3) nearest body points."""
+    normals: np.ndarray
+    """(V, 3) smooth body normals there."""
+
+
+def wrinkle_mesh(coarse: PanelMesh, fine: PanelMesh, config: RelaxationConfig, rng: np.random.Generator) -> WrinkleMesh:
+    """Precompute the stencils of a fine mesh over a coarse one of the same pattern.
+
+    Args:
+        rng: draws the imperfection; one seed is one garment.
+    """
+    lift_faces, lift_weights = locate(coarse, fine.vertex_uv)
+    edges, rest_lengths = _rest_lengths(fine)
+    hinges, weights = _hinges(fine)
+    adjacency = vertex_adjacency(fine.faces, fine.vertex_count)
+    neighbour = adjacency.indices[adjacency.indptr[:-1]]
+    return WrinkleMesh(
+        faces=fine.faces,
+        coarse_faces=coarse.faces,
+        lift_vertices=coarse.faces[lift_faces],
+        lift_weights=lift_weights,
+        tangent_edges=np.stack([np.arange(fine.vertex_count), neighbour], axis=1),
+        edges=edges.astype(np.int32),
+        rest_lengths=rest_lengths.astype(np.float32),
+        hinges=hinges.astype(np.int32),
+        hinge_weights=weights.astype(np.float32),
+        imperfection=smooth_noise(fine.noise_uv, config.imperfection_m, config.imperfection_width_m, rng),
+    )
+
+
+def _corner_lengths(mesh: PanelMesh) -> np.ndarray:
+    """(F, 3) length on the pattern of the side opposite each corner."""
+    a, b, c = mesh.uv.transpose(1, 0, 2)
+    return np.stack([np.linalg.norm(c - b, axis=1), np.linalg.norm(a - c, axis=1), np.linalg.norm(b - a, axis=1)], 1)
+
+
+def _rest_lengths(mesh: PanelMesh) -> tuple[np.ndarray, np.ndarray]:
+    """Unique edges, and their length on the pattern; an edge on a seam takes the mean of its two sides."""
+    edges = unique_edges(mesh.faces)
+    sides = np.sort(mesh.faces[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2).astype(np.int64), axis=1)
+    keys = edges[:, 0].astype(np.int64) * mesh.vertex_count + edges[:, 1]
+    slot = np.searchsorted(keys, sides[:, 0] * mesh.vertex_count + sides[:, 1])
+    lengths = _corner_lengths(mesh).ravel()
+    return edges, np.bincount(slot, lengths, len(edges)) / np.bincount(slot, minlength=len(edges))
+
+
+def _hinges(mesh: PanelMesh) -> tuple[np.ndarray, np.ndarray]:
+    """Bending stencils of the inner edges from the pattern's angles; seams bend like the cloth around them."""
+    lengths = _corner_lengths(mesh)
+    squared = lengths**2
+    heron = (
+        4
+        * np.linalg.norm(
+            np.cross(
+                np.pad(mesh.uv[:, 1] - mesh.uv[:, 0], ((0, 0), (0, 1))),
+                np.pad(mesh.uv[:, 2] - mesh.uv[:, 0], ((0, 0), (0, 1))),
+            ),
+            axis=1,
+        )
+        / 2
+    )
+    cotangents = (squared[:, [1, 2, 0]] + squared[:, [2, 0, 1]] - squared) / heron[:, None]  # at each corner
+
+    corners = np.array([[0, 1, 2], [1, 2, 0], [2, 0, 1]])  # edge start, edge end, opposite corner
+    start = mesh.faces[:, corners[:, 0]].ravel().astype(np.int64)
+    end = mesh.faces[:, corners[:, 1]].ravel().astype(np.int64)
+    opposite = mesh.faces[:, corners[:, 2]].ravel()
+    at_start, at_end = cotangents[:, corners[:, 0]].ravel(), cotangents[:, corners[:, 1]].ravel()
+    keys = np.minimum(start, end) * mesh.vertex_count + np.maximum(start, end)
+    order = np.argsort(keys, kind="stable")
+    paired = np.flatnonzero(keys[order][1:] == keys[order][:-1])
+    first, second = order[paired], order[paired + 1]
+    hinges = np.stack([start[first], end[first], opposite[first], opposite[second]], axis=1)
+    # The neighbour runs through the edge the other way: its start is our end.
+    same_way = start[first] == start[second]
+    c_start = np.where(same_way, at_start[second], at_end[second])
+    c_end = np.where(same_way, at_end[second], at_start[second])
+    weights = np.stack(
+        [
+            at_end[first] + c_end,
+            at_start[first] + c_start,
+            -at_start[first] - at_end[first],
+            -c_start - c_end,
+        ],
+        axis=1,
+    )
+    return hinges, np.column_stack([weights, 1 / (weights**2).sum(axis=1)])
+
+
+def lift(mesh: WrinkleMesh, coarse: np.ndarray, smoothing: float = 0.6) -> tuple[np.ndarray, np.ndarray]:
+    """Place the fine mesh on a coarse frame by Phong tessellation.
+
+    Returns:
+        Positions and unit normals, both (V, 3) float64.
+    """
+    normals = vertex_normals(coarse, mesh.coarse_faces)[mesh.lift_vertices]
+    corners, weights = coarse[mesh.lift_vertices], mesh.lift_weights[..., None]
+    flat = (corners * weights).sum(axis=1)
+    projected = flat[:, None] - ((flat[:, None] - corners) * normals).sum(axis=2, keepdims=True) * normals
+    curved = (1 - smoothing) * flat + smoothing * (projected * weights).sum(axis=1)
+    normal = (normals * weights).sum(axis=1)
+    return curved, normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+
+def body_planes(points: np.ndarray, surface: np.ndarray, faces: np.ndarray) -> BodyPlanes:
+    """Nearest body point and smooth normal for each cloth point."""
+    return _BodySurface.create(surface, faces).planes(points)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _BodySurface:
+    """A posed body that is looked up several times."""
+
+    scene: Any
+    faces: np.ndarray
+    normals: np.ndarray
+
+    @staticmethod
+    def create(surface: np.ndarray, faces: np.ndarray) -> _BodySurface:
+        scene = import_open3d().t.geometry.RaycastingScene(nthreads=1)
+        scene.add_triangles(surface.astype(np.float32), faces.astype(np.uint32))
+        return _BodySurface(scene, faces, vertex_normals(surface, faces))
+
+    def planes(self, points: np.ndarray) -> BodyPlanes:
+        closest = self.scene.compute_closest_points(points.astype(np.float32))
+        uv = closest["primitive_uvs"].numpy()
+        corners = self.faces[closest["primitive_ids"].numpy()]
+        weights = np.column_stack([1 - uv.sum(axis=1), uv])
+        normals = np.einsum("vk,vkc->vc", weights, self.normals[corners])
+        return BodyPlanes(closest["points"].numpy(), normals / np.linalg.norm(normals, axis=1, keepdims=True))
+
+
+def _may_touch(mesh: WrinkleMesh, coarse: np.ndarray, base: np.ndarray, body: _BodySurface, reach: float) -> np.ndarray:
+    """Which fine vertices may lie within `reach` of the body, (n,); four in ten do not, and are not looked up.
+
+    A vertex is no nearer to the body than a coarse vertex beside it less the way between them.
+    """
+    planes = body.planes(coarse)
+    away = coarse - planes.points
+    outside = np.einsum("vc,vc->v", away, planes.normals) > 0
+    distance = np.where(outside, np.linalg.norm(away, axis=1), 0)[mesh.lift_vertices]
+    way = np.linalg.norm(base[:, None] - coarse[mesh.lift_vertices], axis=2)
+    return np.flatnonzero((distance - way).max(axis=1) < reach)
+
+
+def relax_frame(
+    mesh: WrinkleMesh,
+    coarse: np.ndarray,
+    surface: np.ndarray,
+    body_faces: np.ndarray,
+    previous_offsets: np.ndarray | None,
+    fabric: Fabric,
+    config: RelaxationConfig,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Fold the fine mesh over one coarse frame.
+
+    Args:
+        coarse: (C, 3) coarse cloth.
+        surface: (B, 3) body surface of the same frame.
+        previous_offsets: what the call for the frame before returned; None to start anew, with more sweeps.
+    Returns:
+        Fine vertices (V, 3) float32, and their offsets from the lifted sheet in material frames, (V, 3) float32.
+    """
+    base, normals = lift(mesh, coarse)
+    frames = _material_frames(mesh, base, normals)
+    offsets = np.zeros((len(base), 3))
+    offsets[:, 2] = mesh.imperfection
+    sweeps = config.sweeps
+    if previous_offsets is None:
+        sweeps *= config.start_sweeps_factor
+    else:
+        offsets = config.warm_start * previous_offsets + (1 - config.warm_start) * offsets
+    points = (base + np.einsum("vji,vj->vi", frames, offsets)).astype(np.float32)
+    body = _BodySurface.create(surface, body_faces)
+    near = _may_touch(mesh, coarse, base, body, config.radius_m + 2 * config.body_margin_m)
+    plane_points, plane_normals = (base - normals).astype(np.float32), normals.astype(np.float32)  # out of the way
+    for planes_at in (base, points):  # the body is a half plane per vertex, so it is looked up again half-way
+        planes = body.planes(planes_at[near])
+        plane_points[near], plane_normals[near] = planes.points, planes.normals
+        _relax(
+            points,
+            base.astype(np.float32),
+            normals.astype(np.float32),
+            mesh.edges,
+            mesh.rest_lengths,
+            mesh.hinges,
+            mesh.hinge_weights,
+            np.float32(fabric.fold_bending),
+            np.float32(config.pull_normal),
+            np.float32(config.pull_tangential),
+            np.float32(config.radius_m),
+            plane_points,
+            plane_normals,
+            np.float32(config.body_margin_m),
+            (sweeps + 1) // 2,
+        )
+    planes = body.planes(points[near])
+    depth = np.einsum("vc,vc->v", points[near] - planes.points, planes.normals) - 0.2 * config.body_margin_m
+    points[near] -= (np.minimum(depth, 0)[:, None] * planes.normals).astype(np.float32)
+    return points, np.einsum("vij,vj->vi", frames, points - base).astype(np.float32)
+
+
+def _material_frames(mesh: WrinkleMesh, base: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """(V, 3, 3) rows tangent, bitangent, normal; the tangent follows a fixed edge of the cloth."""
+    along = base[mesh.tangent_edges[:, 1]] - base[mesh.tangent_edges[:, 0]]
+    along -= (along * normals).sum(axis=1, keepdims=True) * normals
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    return np.stack([along, np.cross(normals, along), normals], axis=1)
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def _relax(
+    x,
+    base,
+    normals,
+    edges,
+    lengths,
+    hinges,
+    weights,
+    bend,
+    pull_n,
+    pull_t,
+    radius,
+    planes,
+    plane_normals,
+    margin,
+    sweeps,
+):
+    one, half = np.float32(1), np.float32(0.5)
+    for sweep in range(sweeps):
+        forward = sweep % 2 == 0
+        for q in range(len(hinges)):
+            e = q if forward else len(hinges) - 1 - q
+            a, b, c, d = hinges[e, 0], hinges[e, 1], hinges[e, 2], hinges[e, 3]
+            wa, wb, wc, wd = weights[e, 0], weights[e, 1], weights[e, 2], weights[e, 3]
+            gain = bend * weights[e, 4]
+            for k in range(3):
+                bent = gain * (wa * x[a, k] + wb * x[b, k] + wc * x[c, k] + wd * x[d, k])
+                x[a, k] -= wa * bent
+                x[b, k] -= wb * bent
+                x[c, k] -= wc * bent
+                x[d, k] -= wd * bent
+        for i in range(len(x)):
+            nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
+            ox, oy, oz = x[i, 0] - base[i, 0], x[i, 1] - base[i, 1], x[i, 2] - base[i, 2]
+            height = ox * nx + oy * ny + oz * nz
+            keep, extra = one - pull_t, (pull_t - pull_n) * height
+            ox, oy, oz = keep * ox + extra * nx, keep * oy + extra * ny, keep * oz + extra * nz
+            size = np.sqrt(ox * ox + oy * oy + oz * oz)
+            if size > radius:
+                ox, oy, oz = ox * radius / size, oy * radius / size, oz * radius / size
+            px, py, pz = base[i, 0] + ox, base[i, 1] + oy, base[i, 2] + oz
+            depth = (
+                (px - planes[i, 0]) * plane_normals[i, 0]
+                + (py - planes[i, 1]) * plane_normals[i, 1]
+                + (pz - planes[i, 2]) * plane_normals[i, 2]
+                - margin
+            )
+            if depth < 0:
+                px -= depth * plane_normals[i, 0]
+                py -= depth * plane_normals[i, 1]
+                pz -= depth * plane_normals[i, 2]
+            x[i, 0], x[i, 1], x[i, 2] = px, py, pz
+        for q in range(len(edges)):
+            e = q if forward else len(edges) - 1 - q
+            i, j = edges[e, 0], edges[e, 1]
+            dx, dy, dz = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
+            size = np.sqrt(dx * dx + dy * dy + dz * dz) + np.float32(1e-9)
+            move = half * (one - lengths[e] / size)
+            dx, dy, dz = dx * move, dy * move, dz * move
+            x[i, 0] += dx
+            x[i, 1] += dy
+            x[i, 2] += dz
+            x[j, 0] -= dx
+            x[j, 1] -= dy
+            x[j, 2] -= dz

@@ -1,0 +1,1 @@
+"""The virtual rig: rays, speckle, noise, fusion."""

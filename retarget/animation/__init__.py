@@ -1,0 +1,1 @@
+"""A learned garment and a motion in, a registered sequence on any body out."""

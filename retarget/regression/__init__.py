@@ -1,0 +1,1 @@
+"""From a motion to the garment's coefficients: linear, by kernels, by an LSTM."""

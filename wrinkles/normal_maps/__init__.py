@@ -1,0 +1,1 @@
+"""DeepWrinkles' second half: low maps in, maps with wrinkles out."""

@@ -1,0 +1,134 @@
+"""Using a trained generator: low maps in, unit normals out, one map at a time."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32
+from torch import Tensor
+from torch.nn import functional
+
+from capture4d.errors import InputError
+from capture4d.files.tensors import read_tensors, write_tensors
+from wrinkles.normal_maps.config import MapConfig, NetworkConfig
+from wrinkles.normal_maps.networks import UNet, set_test_statistics
+from wrinkles.normal_maps.training import load_weights
+
+__all__ = ["WrinkleModel", "load_model", "save_model"]
+
+KIND = "a wrinkle generator"
+HALF_FROM = 32
+"""Filters from which bfloat16 is faster on a CPU."""
+REFERENCE = "reference"
+"""Name of the template's vertices among the tensors."""
+
+
+class WrinkleModel:
+    """A generator and the maps it was trained on."""
+
+    def __init__(
+        self,
+        generator: UNet,
+        config: NetworkConfig,
+        *,
+        texels: int,
+        maps: MapConfig,
+        layout_digest: str,
+        reference: Float32[np.ndarray, "V 3"],
+    ) -> None:
+        self.generator = generator
+        self.config = config
+        self.texels = texels
+        """Side of the maps the generator sees."""
+        self.maps = maps
+        """Of the maps on disk."""
+        self.layout_digest = layout_digest
+        """Of the UV layout; other layouts mean nothing to the generator."""
+        self.reference = reference
+        """The template's vertices to which garment coordinates refer."""
+        set_test_statistics(generator, config.norm_at_test)
+        self._narrow: UNet | None = None
+
+    @torch.inference_mode()
+    def generate(
+        self, low: Float[Tensor, "3 size size"], *, half_precision: bool | None = None
+    ) -> Float[Tensor, "3 size size"]:
+        """Unit normals of a map; zero where `low` is. What a smaller generator adds is enlarged.
+
+        Args:
+            half_precision: layers in bfloat16; by default where it pays, from HALF_FROM filters up. A residual is added
+                in full precision.
+        """
+        shown = (low != 0).any(dim=0, keepdim=True).float()[None]
+        image = low[None]
+        while image.shape[-1] > self.texels:
+            image, shown = _halved(image, shown)
+        if half_precision is None:
+            half_precision = self.config.filters >= HALF_FROM
+        network = self._in_half_precision() if half_precision else self.generator
+        seen = image.to(torch.bfloat16) if half_precision else image
+        made = network.paint(seen.contiguous(memory_format=torch.channels_last)).float()
+        if network.output == "residual":
+            made = image + made
+        if image.shape[-1] != low.shape[-1]:
+            added = (_unit(made) - image) * shown
+            made = low + functional.interpolate(added, size=low.shape[-2:], mode="bilinear", align_corners=False)
+        return _unit(made)[0] * (low != 0).any(dim=0)
+
+    def _in_half_precision(self) -> UNet:
+        """A copy of the generator, made once: the weights must not change any more."""
+        if self._narrow is None:
+            self._narrow = copy.deepcopy(self.generator).to(torch.bfloat16)
+        return self._narrow
+
+
+def _unit(image: Tensor) -> Tensor:
+    """What torch's `normalize` does; its norm over channels takes fifty times as long on a CPU."""
+    return image * image.square().sum(dim=1, keepdim=True).clamp(min=1e-12).rsqrt()
+
+
+def _halved(image: Tensor, shown: Tensor) -> tuple[Tensor, Tensor]:
+    mean = functional.avg_pool2d(image * shown, 2)
+    return _unit(mean), (functional.avg_pool2d(shown, 2) > 0).float()
+
+
+def save_model(path: str | Path, model: WrinkleModel) -> None:
+    """Write the weights and what is needed to rebuild the network."""
+    about = {
+        "network": asdict(model.config),
+        "texels": model.texels,
+        "maps": asdict(model.maps),
+        "layout_digest": model.layout_digest,
+    }
+    weights = {name: tensor.numpy() for name, tensor in model.generator.state_dict().items()}
+    write_tensors(path, KIND, weights | {REFERENCE: model.reference}, about)
+
+
+def load_model(path: str | Path) -> WrinkleModel:
+    """Read a generator.
+
+    Raises:
+        InputError: the file is missing, damaged, not a generator of ours, or its weights are not those of the
+            architecture it claims.
+    """
+    if not Path(path).is_file():
+        raise InputError(f"{path}: no such file; run: capture4d wrinkles train WORK --output MODEL")
+    file = read_tensors(path, KIND)
+    try:
+        config, maps = NetworkConfig(**file.entry("network")), MapConfig(**file.entry("maps"))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path}: expected the settings of a wrinkle generator, found others ({error})") from None
+    with torch.device("meta"):
+        generator = UNet(config)
+    generator.to_empty(device="cpu")
+    reference = file[REFERENCE]
+    weights = {name: torch.from_numpy(each) for name, each in file.tensors.items() if name != REFERENCE}
+    load_weights(generator, weights, source=str(path))
+    return WrinkleModel(
+        generator.to(memory_format=torch.channels_last),  # pyright: ignore[reportCallIssue]
+        config, texels=file.entry("texels"), maps=maps, layout_digest=file.entry("layout_digest"), reference=reference,
+    )  # fmt: skip

@@ -1,0 +1,239 @@
+"""The stage that makes pairs of normal maps: a registered WORK in, WORK/wrinkles/pairs out.
+
+A garment that was animated has no scans. If it moves as a take did, its low maps pair with that take's high ones: what
+a network sees that is to work on the model's answers.
+
+stage.json            what was made
+template.npz          the garment, its UVs as the maps have them, its vertices as garment coordinates refer to them
+low/000123.png        normals of the template, garment coordinates, 16 bit; alpha: the texel shows something
+high/000123.png       normals of the scan; alpha: they are known
+metrics/000123.json   share of the texels that are known, and the angle between the two
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from pathlib import Path
+
+import numpy as np
+
+from capture4d.captures.garment_scans import load_garment_scan
+from capture4d.captures.work_folder import failed_frames, load_registration, registered_digest, work_capture
+from capture4d.errors import InputError
+from capture4d.files.atomic import read_json, write_bytes, write_json
+from capture4d.files.records import load_garment, save_garment
+from capture4d.runs.stage import Stage, open_stage, require_complete
+from capture4d.runs.workers import run_jobs
+from capture4d.types import Mesh, RegisteredSequence
+from wrinkles.normal_maps.config import PairConfig
+from wrinkles.normal_maps.pair_files import layout_digest
+from wrinkles.normal_maps.spaces import decode_png, encode_png
+from wrinkles.normal_maps.template import FramePair, MapTemplate, frame_pairs
+
+__all__ = ["ensure_pairs", "run"]
+
+SCHEMA = 1
+RUN_FRAMES = 24
+"""Frames a worker makes in a row; at both ends of a run a scan is read twice."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Run:
+    work: Path
+    stage: Stage
+    fps: float
+    positions: range
+
+
+def run(
+    work: Path, config: PairConfig, *, high_from: Path | None = None, workers: int = 1, overwrite: bool = False
+) -> str:
+    """Make the pair of every frame that has none yet; the digest of the result.
+
+    Args:
+        high_from: a work folder with finished pairs of the same frames, whose high maps are taken.
+    Raises:
+        InputError: the work folder lacks its registration or its scans' garments, the template has no usable UVs, or
+            the pairs to borrow from are of another template or other frames.
+    """
+    _check(config)
+    if high_from is not None:
+        return _borrow(work, high_from, config, overwrite=overwrite)
+    upstream = _inputs(work)
+    fps = work_capture(work).fps
+    template = _template(work, config)
+    sequence = load_registration(work / "registration")
+    output = work / "wrinkles" / "pairs"
+    stage = open_stage(output, name="pairs", schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite)
+    if not (output / "template.npz").is_file():
+        save_garment(output / "template.npz", replace(sequence.garment, template=template.mesh))
+    frame_ids = sequence.frame_ids.tolist()
+    pending = set(_pending(stage, frame_ids))
+    runs = [range(start, min(start + RUN_FRAMES, len(frame_ids))) for start in range(0, len(frame_ids), RUN_FRAMES)]
+    jobs = [
+        _Run(work, stage, fps, positions) for positions in runs if pending.intersection(frame_ids[p] for p in positions)
+    ]
+
+    def finished() -> int:
+        return len(frame_ids) - len(_pending(stage, frame_ids))
+
+    make = partial(_make, config)
+    for _ in run_jobs(make, jobs, workers=workers, label="normal maps", units=_length, finished=finished):
+        pass
+    _template.cache_clear()
+    maps = [stage.frame_path(frame_id, ".png", folder=folder) for folder in ("low", "high") for frame_id in frame_ids]
+    return stage.finish([output / "template.npz", *maps])
+
+
+def _borrow(work: Path, lender: Path, config: PairConfig, *, overwrite: bool) -> str:
+    """Pairs of this sequence's low maps with another's high maps; the frames that both have."""
+    pairs, upstream = lender / "wrinkles" / "pairs", _lent(work, lender)
+    sequence, theirs = load_registration(work / "registration"), load_registration(lender / "registration")
+    template = MapTemplate.create(sequence.garment, config.map)
+    lent = load_garment(pairs / "template.npz").template
+    if layout_digest(lent, config.map.size) != layout_digest(template.mesh, config.map.size):
+        raise InputError(f"{lender}: expected maps of the template and layout of {work}, found others")
+    template = template.referred_to(lent.vertices)
+    rows = {int(frame_id): row for row, frame_id in enumerate(theirs.frame_ids)}
+    shared = [(row, int(frame_id)) for row, frame_id in enumerate(sequence.frame_ids) if int(frame_id) in rows]
+    if not shared:
+        raise InputError(f"{lender}: expected frames of {work}, found none of its {len(sequence.frame_ids)}")
+    output = work / "wrinkles" / "pairs"
+    sources = {"pairs": pairs}
+    stage = open_stage(
+        output, name="pairs", schema=SCHEMA, config=config, upstream=upstream, sources=sources, overwrite=overwrite
+    )
+    if not (output / "template.npz").is_file():
+        referred = template.mesh.with_vertices(template.reference)
+        save_garment(output / "template.npz", replace(sequence.garment, template=referred))
+    pending = set(_pending(stage, [frame_id for _, frame_id in shared]))
+    shown = template.raster.image(np.ones(len(template.raster.inside), bool))
+    for row, frame_id in shared:
+        if frame_id not in pending:
+            continue
+        vertices = np.array(sequence.vertices[row])
+        ours = template.rotation(vertices)
+        turn = (template.rotation(np.array(theirs.vertices[rows[frame_id]])).T @ ours).astype(np.float32)
+        path = pairs / "high" / f"{frame_id:06d}.png"
+        high, known = decode_png(path.read_bytes(), source=str(path))
+        if high.shape[0] != template.raster.size:
+            raise InputError(f"{path}: expected a map of {template.raster.size} texels, found {high.shape[0]}")
+        low = template.raster.image(template.low_normals(vertices) @ ours.astype(np.float32))
+        write_bytes(stage.frame_path(frame_id, ".png", folder="low"), encode_png(low, shown))
+        write_bytes(stage.frame_path(frame_id, ".png", folder="high"), encode_png(high @ turn, known))
+    maps = [stage.frame_path(frame_id, ".png", folder=folder) for folder in ("low", "high") for _, frame_id in shared]
+    return stage.finish([output / "template.npz", *maps])
+
+
+def ensure_pairs(work: Path, config: PairConfig, *, workers: int = 1) -> None:
+    """Make a work folder's pairs, unless it has finished ones of its present inputs, whatever their settings.
+
+    Raises:
+        InputError: an input is missing, or it is not what the pairs were made from.
+    """
+    record_path = work / "wrinkles" / "pairs" / "stage.json"
+    record = read_json(record_path) if record_path.is_file() else {}
+    made_from = record.get("upstream", {})
+    if "pairs" in made_from:
+        lender = Path(record["sources"]["pairs"]).parents[1]
+        if _lent(work, lender) == made_from and record["status"] == "complete":
+            return
+        run(work, config, high_from=lender, workers=workers)
+    elif record.get("status") != "complete" or made_from != _inputs(work):
+        run(work, config, workers=workers)
+
+
+def _inputs(work: Path) -> dict[str, str]:
+    """Digests of what pairs of a take's own scans are made from."""
+    return {
+        "registration": registered_digest(work),
+        "garment": require_complete(work / "garment", "extract", f"capture4d extract CAPTURE --output {work}"),
+    }
+
+
+def _lent(work: Path, lender: Path) -> dict[str, str]:
+    """Digests of what borrowed pairs are made from."""
+    return {
+        "registration": registered_digest(work),
+        "pairs": require_complete(lender / "wrinkles" / "pairs", "pairs", f"capture4d wrinkles maps {lender}"),
+    }
+
+
+def _pending(stage: Stage, frame_ids: Sequence[int]) -> list[int]:
+    """Frames that lack one map or the other."""
+    missing = {frame_id for folder in ("low", "high") for frame_id in stage.pending(frame_ids, ".png", folder=folder)}
+    return [frame_id for frame_id in frame_ids if frame_id in missing]
+
+
+def _check(config: PairConfig) -> None:
+    for name, value, least in (
+        ("map.size", config.map.size, 1),
+        ("map.padding", config.map.padding, 0),
+        ("projection.border_rings", config.projection.border_rings, 0),
+        ("projection.smoothing_passes", config.projection.smoothing_passes, 0),
+        ("projection.distance_m", config.projection.distance_m, 0),
+        ("projection.angle_deg", config.projection.angle_deg, 0),
+        ("projection.temporal_span_s", config.projection.temporal_span_s, 0),
+        ("projection.blur_texels", config.projection.blur_texels, 0),
+    ):
+        if not (math.isfinite(value) and value >= least):
+            raise InputError(f"{name}: expected a number, at least {least}, found {value:g}")
+
+
+def _length(job: _Run) -> int:
+    return len(job.positions)
+
+
+@lru_cache(maxsize=1)
+def _template(work: Path, config: PairConfig) -> MapTemplate:
+    """One analysis per process and take."""
+    return MapTemplate.create(load_registration(work / "registration").garment, config.map)
+
+
+def _make(config: PairConfig, job: _Run) -> int:
+    """Make and write the missing frames of a run; how many there were."""
+    template = _template(job.work, config)
+    sequence = load_registration(job.work / "registration")
+    frame_ids, failed = sequence.frame_ids.tolist(), failed_frames(job.work)
+    pending = set(_pending(job.stage, [frame_ids[p] for p in job.positions]))
+    missing = [position for position in job.positions if frame_ids[position] in pending]
+
+    def scan(position: int) -> Mesh | None:
+        frame_id = frame_ids[position]
+        if frame_id in failed:
+            return None
+        return load_garment_scan(job.work / "garment" / "frames" / f"{frame_id:06d}.npz", frame_id).mesh
+
+    pairs = frame_pairs(
+        template, frame_ids, range(missing[0], missing[-1] + 1),
+        vertices=lambda position: np.array(sequence.vertices[position]), scan=scan, fps=job.fps,
+        config=config.projection,
+    )  # fmt: skip
+    for pair in pairs:
+        _write(job.stage, template, sequence, pair)
+    return len(missing)
+
+
+def _write(stage: Stage, template: MapTemplate, sequence: RegisteredSequence, pair: FramePair) -> None:
+    """The high map last: with it the frame counts as done."""
+    raster, valid = template.raster, pair.high.valid
+    vertices = np.array(sequence.vertices[sequence.frame_ids.tolist().index(pair.frame_id)])
+    rotation = template.rotation(vertices).astype(np.float32)
+    shown = raster.image(np.ones(len(valid), bool))
+    angle = np.degrees(np.arccos(np.clip((pair.low * pair.high.normals).sum(axis=1), -1, 1)))
+    measured = valid & raster.inside
+    write_json(
+        stage.frame_path(pair.frame_id, ".json", folder="metrics"),
+        {
+            "frame_id": pair.frame_id,
+            "valid_percent": 100 * float(measured.sum() / max(raster.inside.sum(), 1)),
+            "difference_deg": float(angle[measured].mean()) if measured.any() else None,
+        },
+    )
+    low = encode_png(raster.image(pair.low @ rotation), shown)
+    high = encode_png(raster.image(pair.high.normals @ rotation), raster.image(valid))
+    write_bytes(stage.frame_path(pair.frame_id, ".png", folder="low"), low)
+    write_bytes(stage.frame_path(pair.frame_id, ".png", folder="high"), high)

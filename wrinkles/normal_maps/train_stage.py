@@ -1,0 +1,270 @@
+"""The stage that trains the wrinkle GAN: pairs of one or more work folders in, a MODEL folder out.
+
+stage.json                 what was run
+generator.safetensors      the weights, with what is needed to rebuild the network
+checkpoints/000500.safetensors   everything a resume needs; the last two are kept
+metrics.jsonl              losses, one line every `log_every` steps
+samples/000500.png         held-out frames: input, made, true
+held_out.json              measures on the held-out frames: of the maps made, and of the low maps
+takes.json                 digests of the registrations it learned from
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import safetensors.torch
+import torch
+from safetensors import SafetensorError
+
+from capture4d.captures.work_folder import registered_digest
+from capture4d.errors import InputError
+from capture4d.files.atomic import read_json, read_json_lines, write_bytes, write_json
+from capture4d.geometry.uv_layout import millimetres_per_texel
+from capture4d.runs.stage import Stage, open_stage, require_complete
+from capture4d.runs.workers import progress
+from capture4d.types import Mesh
+from wrinkles.normal_maps.config import PairConfig, WrinkleConfig
+from wrinkles.normal_maps.inference import WrinkleModel, save_model
+from wrinkles.normal_maps.metrics import MapScores, score
+from wrinkles.normal_maps.pair_files import layout_digest, load_pairs, map_settings, pair_template, surface_texels
+from wrinkles.normal_maps.pair_stage import ensure_pairs
+from wrinkles.normal_maps.pair_stage import run as make_pairs
+from wrinkles.normal_maps.pairs import PairTake, batches, consecutive_pairs, fitted, split
+from wrinkles.normal_maps.spaces import to_colours
+from wrinkles.normal_maps.training import TrainingState, load_tensors, new_state, state_tensors, train_step
+
+__all__ = ["learned_takes", "run", "score_take"]
+
+SCHEMA = 1
+TAKES = "takes.json"
+KEPT_CHECKPOINTS = 2
+SAMPLES = 4
+LOGGED = "logged."
+"""Begins the names, in a checkpoint, of losses that no line of the log holds yet."""
+
+
+def run(
+    works: Sequence[Path],
+    output: Path,
+    config: WrinkleConfig,
+    *,
+    pairs: PairConfig | None = None,
+    workers: int = 1,
+    overwrite: bool = False,
+) -> str:
+    """Make the pairs that are missing, train, measure; the digest of the result.
+
+    Pairs that are there are used as they are, unless `pairs` asks for other than the default.
+
+    Equal inputs, settings and numbers of `workers`, which are torch's threads here, give equal weights, however often
+    the run was interrupted.
+
+    Raises:
+        InputError: no or differing takes, or a checkpoint of another architecture.
+    """
+    _check(config)
+    if not works:
+        raise InputError("wrinkles train: expected at least one work folder, found none")
+    for work in works:
+        if pairs is None or pairs == PairConfig():
+            ensure_pairs(work, PairConfig(), workers=workers)
+        else:
+            make_pairs(work, pairs, workers=workers)
+    upstream = {
+        work.name: require_complete(work / "wrinkles" / "pairs", "pairs", f"capture4d wrinkles maps {work}")
+        for work in works
+    }
+    if len(upstream) < len(works):
+        raise InputError("wrinkles train: expected work folders of different names, found two alike")
+    takes = [load_pairs(work) for work in works]
+    mesh, maps = pair_template(works[0]), map_settings(works[0])
+    digest = layout_digest(mesh, maps.size)
+    for work in works:
+        if layout_digest(pair_template(work), map_settings(work).size) != digest:
+            raise InputError(
+                f"{work}: expected the UV layout of {works[0]}, found another; one network needs one layout"
+            )
+    parts = [split(fitted(take, config.texels), held_out=config.held_out, gap=config.held_out_gap) for take in takes]
+    consecutive_pairs([train for train, _ in parts])
+    torch.set_num_threads(workers)
+    state = new_state(config)
+    stage = open_stage(
+        output, name="train-wrinkles", schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite
+    )
+    write_json(stage.path / TAKES, {work.name: registered_digest(work) for work in works})
+    recent = _resume(stage, state)
+    _train(stage, state, recent, [train for train, _ in parts], [held for _, held in parts], config)
+    model = WrinkleModel(
+        state.generator, config.network, texels=config.texels, maps=maps, layout_digest=digest, reference=mesh.vertices
+    )
+    save_model(stage.path / "generator.safetensors", model)
+    measured = {}
+    for _, held in parts:
+        if len(held.frame_ids):
+            made, low = score_take(model, held, mesh)
+            measured[held.name] = {"made": _json(made), "low": _json(low)}
+    write_json(stage.path / "held_out.json", measured)
+    return stage.finish([stage.path / "generator.safetensors"])
+
+
+def learned_takes(model: Path) -> set[str]:
+    """Digests of the registrations that a trained network learned from."""
+    path = model / TAKES
+    return set(read_json(path).values()) if path.is_file() else set()
+
+
+def _check(config: WrinkleConfig) -> None:
+    schedule = config.schedule
+    counts = {
+        "texels": config.texels,
+        "network.filters": config.network.filters,
+        "network.layers": config.network.layers,
+        "schedule.steps": schedule.steps,
+        "schedule.batch": schedule.batch,
+        "schedule.checkpoint_every": schedule.checkpoint_every,
+        "schedule.sample_every": schedule.sample_every,
+        "schedule.log_every": schedule.log_every,
+    }
+    for name, value in counts.items():
+        if value < 1:
+            raise InputError(f"{name}: expected at least 1, found {value}")
+    if config.held_out_gap < 0:
+        raise InputError(f"held_out_gap: expected at least 0, found {config.held_out_gap}")
+    if not schedule.learning_rate > 0:
+        raise InputError(f"schedule.learning_rate: expected a positive rate, found {schedule.learning_rate:g}")
+    if not 0 <= schedule.beta1 < 1:
+        raise InputError(f"schedule.beta1: expected a number from 0 to below 1, found {schedule.beta1:g}")
+    if not 0 <= config.held_out < 1:
+        raise InputError(f"held_out: expected a share from 0 to below 1, found {config.held_out:g}")
+
+
+def score_take(model: WrinkleModel, take: PairTake, mesh: Mesh) -> tuple[MapScores, MapScores]:
+    """Measures of generated maps, and of their inputs, against the high maps of a take, where they show the surface.
+
+    Args:
+        mesh: the template, its UVs as the maps have them.
+    """
+    known = take.valid & surface_texels(mesh, model.maps.size, model.texels)
+    mm_per_texel = millimetres_per_texel(mesh, model.texels)
+    made = torch.stack([model.generate(low.float()) for low in take.low])
+    truth, consecutive = take.high.float(), torch.zeros(len(made), dtype=torch.bool)
+    consecutive[torch.from_numpy(take.consecutive())] = True
+
+    def against_truth(maps: torch.Tensor) -> MapScores:
+        return score(maps, truth, known, mm_per_texel=mm_per_texel, consecutive=consecutive)
+
+    return against_truth(made), against_truth(take.low.float())
+
+
+def _train(
+    stage: Stage,
+    state: TrainingState,
+    recent: list[dict[str, float]],
+    train: list[PairTake],
+    held: list[PairTake],
+    config: WrinkleConfig,
+) -> None:
+    """Go on to the last step.
+
+    Args:
+        recent: losses since the last row of the log.
+    """
+    schedule = config.schedule
+    rows = _logged(stage.path / "metrics.jsonl", state.step)
+    stream = batches(train, size=schedule.batch, seed=config.seed, start=state.step)
+    with progress("train", schedule.steps, completed=state.step) as advance:
+        while state.step < schedule.steps:
+            recent.append(train_step(state, next(stream), config))
+            advance(1)
+            last = state.step == schedule.steps
+            if state.step % schedule.log_every == 0 or last:
+                mean = {name: float(np.mean([losses[name] for losses in recent])) for name in sorted(recent[0])}
+                rows.append({"step": state.step, **mean})
+                recent.clear()
+            if state.step % schedule.sample_every == 0 or last:
+                _write_samples(stage, state, held, config)
+            if state.step % schedule.checkpoint_every == 0 or last:
+                _write_log(stage.path / "metrics.jsonl", rows)
+                _save(stage, state, recent)
+
+
+def _checkpoint(stage: Stage, step: int) -> Path:
+    return stage.path / "checkpoints" / f"{step:06d}.safetensors"
+
+
+def _checkpoints(stage: Stage) -> list[Path]:
+    """The oldest first."""
+    paths = (path for path in (stage.path / "checkpoints").glob("*.safetensors") if path.stem.isdigit())
+    return sorted(paths, key=lambda path: int(path.stem))
+
+
+def _save(stage: Stage, state: TrainingState, recent: Sequence[Mapping[str, float]]) -> None:
+    names = sorted(recent[0]) if recent else ()
+    logged = {
+        f"{LOGGED}{name}": torch.tensor([losses[name] for losses in recent], dtype=torch.float64) for name in names
+    }
+    write_bytes(_checkpoint(stage, state.step), safetensors.torch.save(state_tensors(state) | logged))
+    for old in _checkpoints(stage)[:-KEPT_CHECKPOINTS]:
+        old.unlink()
+
+
+def _resume(stage: Stage, state: TrainingState) -> list[dict[str, float]]:
+    """Go on from the newest checkpoint, if there is one; the losses that it had not logged yet."""
+    paths = _checkpoints(stage)
+    if not paths:
+        return []
+    try:
+        tensors = safetensors.torch.load(paths[-1].read_bytes())
+    except SafetensorError as error:
+        raise InputError(f"{paths[-1]}: not a readable checkpoint, cut off or damaged ({error})") from None
+    logged = {name: tensors.pop(name).tolist() for name in list(tensors) if name.startswith(LOGGED)}
+    load_tensors(state, tensors, source=str(paths[-1]))
+    names = [name.removeprefix(LOGGED) for name in logged]
+    return [dict(zip(names, losses, strict=True)) for losses in zip(*logged.values(), strict=True)]
+
+
+def _logged(path: Path, step: int) -> list[dict[str, float]]:
+    """Rows up to a step; what was logged after the last checkpoint is done again."""
+    if not path.is_file():
+        return []
+    return [row for row in read_json_lines(path) if row.get("step", step + 1) <= step]
+
+
+def _write_log(path: Path, rows: Sequence[dict[str, float]]) -> None:
+    write_bytes(path, "".join(json.dumps(row) + "\n" for row in rows).encode())
+
+
+def _write_samples(stage: Stage, state: TrainingState, held: list[PairTake], config: WrinkleConfig) -> None:
+    """A sheet of held-out frames, a row each: input, made, true. Leaves the random state as it was."""
+    frames = [(take, at) for take in held for at in range(len(take.frame_ids))]
+    if not frames:
+        return
+    chosen = [frames[int(at)] for at in np.linspace(0, len(frames) - 1, min(SAMPLES, len(frames)))]
+    random = torch.get_rng_state()
+    state.generator.eval()
+    rows = []
+    with torch.inference_mode():
+        for take, at in chosen:
+            low = take.low[at].float()
+            made = state.generator(low[None])[0] * (low != 0).any(dim=0)
+            row = torch.cat([low, made, take.high[at].float()], dim=2)
+            rows.append(to_colours(row.permute(1, 2, 0).numpy()))
+    torch.set_rng_state(random)
+    write_bytes(stage.path / "samples" / f"{state.step:06d}.png", _png(np.concatenate(rows)))
+
+
+def _png(picture: np.ndarray) -> bytes:
+    import cv2
+
+    good, data = cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]))
+    assert good
+    return data.tobytes()
+
+
+def _json(scores: MapScores) -> dict[str, float | None]:
+    return {name: value if np.isfinite(value) else None for name, value in asdict(scores).items()}

@@ -1,0 +1,1 @@
+"""Pixel-based cloth: offsets from the body as images in pattern space."""
