@@ -292,7 +292,7 @@ def test_workers_do_not_outlive_a_killed_parent(tmp_path: Path):
             """
         )
     )
-    parent = subprocess.Popen([sys.executable, script], stderr=subprocess.DEVNULL, cwd=Path(__file__).parents[3])
+    parent = subprocess.Popen([sys.executable, script], stderr=subprocess.DEVNULL, cwd=Path(__file__).parents[4])
     try:
         wait_for(lambda: len(list(tmp_path.glob("*.pid"))) == 2)
     finally:

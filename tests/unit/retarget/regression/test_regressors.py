@@ -371,7 +371,7 @@ save_lstm(pathlib.Path(sys.argv[1]) / "done.safetensors", found, model_digest="x
 @pytest.mark.slow
 def test_a_killed_run_ends_with_the_same_bits(tmp_path: Path) -> None:
     def start(folder: str) -> subprocess.Popen:
-        return subprocess.Popen([sys.executable, "-c", TRAIN, str(tmp_path / folder)], cwd=Path(__file__).parents[3])
+        return subprocess.Popen([sys.executable, "-c", TRAIN, str(tmp_path / folder)], cwd=Path(__file__).parents[4])
 
     assert start("whole").wait() == 0
     for kill in range(3):

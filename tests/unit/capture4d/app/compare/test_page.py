@@ -18,8 +18,8 @@ from capture4d.files.records import save_body, save_poses
 from capture4d.types import PoseSequence, Scan
 from retarget.garment_model import load_garment_model
 from tests.unit.wrinkles.conftest import make_work, outside_the_unit_square, some_garment, some_scan
-from tests.unit.wrinkles.test_offsets import limb, upright
-from tests.unit.wrinkles.test_stages import SMALL
+from tests.unit.wrinkles.normal_maps.test_stages import SMALL
+from tests.unit.wrinkles.offset_images.test_layout import limb, upright
 
 FRAMES = 8
 

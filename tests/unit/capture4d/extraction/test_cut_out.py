@@ -11,7 +11,7 @@ from capture4d.extraction import garment
 from capture4d.extraction.border_loops import SHIRT
 from capture4d.extraction.garment import cut_out
 from capture4d.types import GarmentScan, Mesh, Scan
-from tests.unit.capture4d.test_border_loops import shirt
+from tests.unit.capture4d.extraction.test_border_loops import shirt
 
 
 def test_borders_of_one_learned_paint_are_separated_named_and_ordered(monkeypatch: pytest.MonkeyPatch) -> None:

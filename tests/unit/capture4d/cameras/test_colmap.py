@@ -15,7 +15,7 @@ from capture4d.errors import InputError
 from capture4d.heavy_imports import import_pycolmap
 from capture4d.types import Rig
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[4]
 
 
 @pytest.fixture(params=[0, 1])

@@ -15,7 +15,7 @@ def test_the_list_names_every_benchmark_and_each_has_quick_figures_to_hold(capsy
     assert main(["--list"]) == 0
     names = capsys.readouterr().out.split()
     assert {"registration", "resume", "synthesis"} <= set(names)
-    committed = json.loads((Path(__file__).parents[2] / "benchmarks" / "baseline.json").read_text())
+    committed = json.loads((Path(__file__).parents[3] / "benchmarks" / "baseline.json").read_text())
     for name in names:
         assert committed[f"{name}-quick"], f"--gate holds nothing for {name}"
 
