@@ -1,6 +1,12 @@
 """The exception that means "the input is at fault, not the program", and three faults that callers tell apart."""
 
+from copy import copy
+from os import PathLike, fspath
+from typing import Any, TypeVar
+
 __all__ = ["EmptyMeshError", "InputError", "NotFiniteError", "StaleError"]
+
+Fault = TypeVar("Fault", bound="InputError")
 
 
 class InputError(ValueError):
@@ -9,7 +15,25 @@ class InputError(ValueError):
     The message is one line that names the file, frame or argument, says what was expected, and what was found. The
     command line prints it without a traceback and exits with 1; every other exception is our own bug and keeps its
     traceback.
+
+    Attributes:
+        reason: the message without the file.
+        where: the file or folder that the message begins with, None if it names none.
     """
+
+    def __init__(self, reason: str, *, where: str | PathLike[str] | None = None) -> None:
+        self.reason, self.where = reason, None if where is None else fspath(where)
+        super().__init__(reason if self.where is None else f"{self.where}: {reason}")
+
+    def at(self: Fault, where: str | PathLike[str]) -> Fault:
+        """The same fault, of that file or folder instead of the one it named."""
+        moved = copy(self)
+        InputError.__init__(moved, self.reason, where=where)
+        return moved
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Whole again on the other side of a process."""
+        return _rebuilt, (type(self), {**self.__dict__})
 
 
 class EmptyMeshError(InputError):
@@ -22,3 +46,10 @@ class NotFiniteError(InputError):
 
 class StaleError(InputError):
     """A stage's earlier output, made with other settings or from other inputs."""
+
+
+def _rebuilt(kind: type[InputError], state: dict[str, Any]) -> InputError:
+    error = kind.__new__(kind)
+    InputError.__init__(error, state["reason"], where=state["where"])
+    error.__dict__.update(state)
+    return error

@@ -11,11 +11,12 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import wait
-from typing import TypeVar
+from typing import Any, TypeVar, overload
 
 __all__ = ["WorkerDied", "progress", "run_jobs"]
 
 Job = TypeVar("Job")
+Prepared = TypeVar("Prepared")
 Result = TypeVar("Result")
 
 
@@ -23,10 +24,32 @@ class WorkerDied(RuntimeError):
     """A worker process ended without an answer: killed, or out of memory. Finished frames are on disk."""
 
 
+@overload
 def run_jobs(
     function: Callable[[Job], Result],
     jobs: Sequence[Job],
     *,
+    workers: int,
+    label: str,
+    units: Callable[[Job], int] | None = None,
+    finished: Callable[[], int] | None = None,
+) -> Iterator[Result]: ...
+@overload
+def run_jobs(
+    function: Callable[[Prepared, Job], Result],
+    jobs: Sequence[Job],
+    *,
+    prepare: Callable[[], Prepared],
+    workers: int,
+    label: str,
+    units: Callable[[Job], int] | None = None,
+    finished: Callable[[], int] | None = None,
+) -> Iterator[Result]: ...
+def run_jobs(
+    function: Callable[..., Result],
+    jobs: Sequence[Job],
+    *,
+    prepare: Callable[[], Any] | None = None,
     workers: int,
     label: str,
     units: Callable[[Job], int] | None = None,
@@ -36,6 +59,8 @@ def run_jobs(
 
     Args:
         function: importable by name, as are its jobs and results, for they travel to new processes.
+        prepare: makes what all jobs need, once in each process, before its first job: `function(prepared, job)`. A
+            function of a module, or a `functools.partial` of one, with what it needs.
         workers: processes; 1 runs the jobs here, in order. Each worker computes on one thread, so that results do not
             depend on how many there are.
         units: how much of the progress a job is worth, 1 each if None.
@@ -48,18 +73,22 @@ def run_jobs(
     total = sum(units(job) if units else 1 for job in jobs)
     with progress(label, total, finished) as advance:
         if workers <= 1 or len(jobs) <= 1:
+            given = () if prepare is None else (prepare(),)
             for job in jobs:
-                result = function(job)
+                result = function(*given, job)
                 advance(units(job) if units else 1)
                 yield result
             return
         before = set(multiprocessing.active_children())
         pool = ProcessPoolExecutor(
-            min(workers, len(jobs)), multiprocessing.get_context("spawn"), initializer=_start_worker
+            min(workers, len(jobs)),
+            multiprocessing.get_context("spawn"),
+            initializer=_start_worker,
+            initargs=(function, prepare),
         )
         try:
             with _worker_environment():
-                futures: dict[Future[Result], Job] = {pool.submit(function, job): job for job in jobs}
+                futures: dict[Future[Result], Job] = {pool.submit(_work, job): job for job in jobs}
             for future in as_completed(futures):
                 result = future.result()
                 advance(units(futures[future]) if units else 1)
@@ -100,8 +129,25 @@ def _worker_environment() -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _start_worker() -> None:
-    """End with the parent, however it ends."""
+_function: Callable[..., Any] | None = None
+_prepare: Callable[[], Any] | None = None
+_prepared: tuple[Any, ...] | None = None
+"""Of this process, if it is a worker: it serves one pool, from its start to its end."""
+
+
+def _work(job: Any) -> Any:
+    """Run one job in a worker, which prepares before its first: there, so that a fault travels back as a job's does."""
+    global _prepared
+    if _prepared is None:
+        _prepared = () if _prepare is None else (_prepare(),)
+    assert _function is not None
+    return _function(*_prepared, job)
+
+
+def _start_worker(function: Callable[..., Any], prepare: Callable[[], Any] | None) -> None:
+    """Take the work, and end with the parent, however it ends."""
+    global _function, _prepare
+    _function, _prepare = function, prepare
     parent = multiprocessing.parent_process()
     assert parent is not None
 

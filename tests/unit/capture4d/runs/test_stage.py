@@ -8,6 +8,7 @@ import sys
 import textwrap
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -314,3 +315,32 @@ def wait_for(condition, *, seconds: float = 60) -> None:
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.05)
+
+
+def count_preparations(folder: Path) -> Path:
+    (folder / f"{os.getpid()}-{len(list(folder.iterdir()))}").touch()
+    return folder
+
+
+def add_to(folder: Path, job: int) -> tuple[Path, int]:
+    return folder, job
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_each_process_prepares_once(tmp_path: Path, workers: int):
+    prepare = partial(count_preparations, tmp_path)
+    results = list(run_jobs(add_to, range(8), prepare=prepare, workers=workers, label="prepare"))
+    assert sorted(results) == [(tmp_path, job) for job in range(8)]
+    processes = [path.name.partition("-")[0] for path in tmp_path.iterdir()]
+    assert len(processes) == len(set(processes)) <= workers
+
+
+def refuse() -> int:
+    raise InputError("expected a folder, found none", where="work")
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_what_is_wrong_with_a_preparation_is_said_as_it_is(workers: int):
+    with pytest.raises(InputError, match=r"^work: expected a folder, found none$") as caught:
+        list(run_jobs(add_to, range(2), prepare=refuse, workers=workers, label="prepare"))
+    assert (caught.value.where, caught.value.reason) == ("work", "expected a folder, found none")

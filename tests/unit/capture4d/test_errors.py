@@ -1,0 +1,22 @@
+"""A fault keeps its file apart from its reason, whatever it travels through."""
+
+import copy
+import pickle
+
+import pytest
+
+from capture4d.errors import InputError, StaleError
+
+
+@pytest.mark.parametrize("kind", [InputError, StaleError])
+@pytest.mark.parametrize("travel", [copy.copy, lambda error: pickle.loads(pickle.dumps(error))])
+def test_an_error_travels_whole(kind, travel):
+    error = travel(kind("expected 3 numbers, found 2", where="rig.json"))
+    assert type(error) is kind
+    assert str(error) == "rig.json: expected 3 numbers, found 2"
+    assert (error.where, error.reason) == ("rig.json", "expected 3 numbers, found 2")
+
+
+def test_the_file_is_named_once_however_often_it_is_told():
+    error = InputError("expected 3 numbers, found 2").at("a.json").at("b.json")
+    assert str(error) == "b.json: expected 3 numbers, found 2"
