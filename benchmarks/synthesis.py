@@ -74,7 +74,7 @@ def run(*, quick: bool = False, frames: int = 120, workers: int = 2) -> list[Met
         rows.append(row)
     with tempfile.TemporaryDirectory(prefix="capture4d-synthesis-") as scratch:
         tiny = replace(PRESETS["tiny"], frames=2, capture_every=2)
-        digests = {synthesise(Path(scratch) / str(count), tiny, workers=count) for count in (1, 2)}
+        digests = {synthesise(Path(scratch) / str(count), tiny, workers=count).digest for count in (1, 2)}
 
     def mean(key: str) -> float:
         return float(np.mean([row[key] for row in rows if key in row]))

@@ -24,7 +24,7 @@ from capture4d.files.records import load_rig, save_garment, save_rig
 from capture4d.geometry.closest_points import closest_points
 from capture4d.geometry.mesh import boundary_loops
 from capture4d.heavy_imports import import_open3d
-from capture4d.runs.stage import Stage, open_stage
+from capture4d.runs.stage import Stage, StageResult, open_stage
 from capture4d.runs.workers import run_jobs
 from capture4d.types import Garment, Mesh
 from data_synth.mesh_sequence import MeshSequence, open_sequence
@@ -55,7 +55,7 @@ def run(
     template: Path | None = None,
     workers: int = 1,
     overwrite: bool = False,
-) -> str:
+) -> StageResult:
     """Scan every mesh that has no whole scan yet, or has lost its truth; the digest of the capture.
 
     Args:

@@ -14,7 +14,7 @@ from capture4d.captures.truth import TruthFrame, TruthModel, write_truth_frame, 
 from capture4d.errors import InputError
 from capture4d.files.atomic import file_digest, write_json, write_npz
 from capture4d.files.records import load_rig, save_body, save_garment, save_poses, save_rig
-from capture4d.runs.stage import Stage, open_stage
+from capture4d.runs.stage import Stage, StageResult, open_stage
 from capture4d.runs.workers import run_jobs
 from capture4d.types import Mesh, Rig
 from data_synth.cloth.patterns import locate
@@ -53,8 +53,8 @@ SIMULATED = (
 QUALITY = "truth/quality.json"
 
 
-def run(output: Path, config: SynthConfig, *, workers: int = 2, overwrite: bool = False) -> str:
-    """Simulate and scan a take; the digest of the capture folder.
+def run(output: Path, config: SynthConfig, *, workers: int = 2, overwrite: bool = False) -> StageResult:
+    """Simulate and scan a take.
 
     Simulation is sequential and starts over when it was interrupted; scans are made in parallel and kept. Files that a
     finished take has lost are made anew, for which the clip is simulated again.
@@ -144,17 +144,17 @@ def _unscanned(stage: Stage, config: SynthConfig) -> list[int]:
     return sorted(pending)
 
 
-def finish_take(stage: Stage, config: SynthConfig) -> str:
-    """Close the folder of a take whose frames are all there; its digest."""
+def finish_take(stage: Stage, config: SynthConfig) -> StageResult:
+    """Close the folder of a take whose frames are all there."""
     frame_ids = list(range(1, config.frames + 1))
     _write_quality(stage, frame_ids)
     files = [stage.path / name for name in (*SIMULATED, QUALITY)]
     files += [stage.frame_path(frame_id, folder="truth") for frame_id in frame_ids]
     if config.scans:
         files += [stage.frame_path(frame_id, ".ply", folder="scans") for frame_id in frame_ids]
-    digest = stage.finish(files)
+    result = stage.finish(files)
     shutil.rmtree(stage.path / "cloth", ignore_errors=True)
-    return digest
+    return result
 
 
 def simulate_clip(job: SimulationJob) -> None:

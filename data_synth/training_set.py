@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from capture4d.files.atomic import write_bytes, write_json
-from capture4d.runs.stage import Stage, open_stage
+from capture4d.runs.stage import Stage, StageResult, open_stage
 from capture4d.runs.workers import run_jobs
 from data_synth.config import SynthConfig, TrainingSetConfig
 from data_synth.setting_checks import check_synth
@@ -35,8 +35,8 @@ __all__ = ["body_takes", "run"]
 SCHEMA = 1
 
 
-def run(output: Path, config: TrainingSetConfig, *, workers: int = 2, overwrite: bool = False) -> str:
-    """Make what is missing of a training set; the digest of all of it.
+def run(output: Path, config: TrainingSetConfig, *, workers: int = 2, overwrite: bool = False) -> StageResult:
+    """Make what is missing of a training set.
 
     Raises:
         InputError: a setting of a take is out of range, or the folder holds something else.
@@ -62,7 +62,7 @@ def run(output: Path, config: TrainingSetConfig, *, workers: int = 2, overwrite:
     scans = [job for each in takes.values() for job in scan_jobs(*each)]
     for _ in run_jobs(scan_frame, scans, workers=workers, label="Scanning"):
         pass
-    digests = {name: _finish(output, config, *each) for name, each in takes.items()}
+    digests = {name: _finish(output, config, *each).digest for name, each in takes.items()}
     note = {"held_out": config.held_out, "reversed": config.reversed, "bodies": config.bodies, "digests": digests}
     write_json(output / "set.json", note)
     return stage.finish([output / "set.json"])
@@ -85,7 +85,7 @@ def body_takes(config: TrainingSetConfig) -> Mapping[str, Mapping[str, SynthConf
     }
 
 
-def _finish(output: Path, config: TrainingSetConfig, stage: Stage, take: SynthConfig) -> str:
+def _finish(output: Path, config: TrainingSetConfig, stage: Stage, take: SynthConfig) -> StageResult:
     """Close a take, with the template of the first: a lab makes one, and registers it to every take."""
     first = output / "takes" / next(iter(config.takes)) / "template.npz"
     if take.drafted_for is None:

@@ -40,7 +40,7 @@ from capture4d.captures.work_folder import (
 from capture4d.errors import InputError
 from capture4d.files.atomic import read_json, write_bytes, write_json, write_npz
 from capture4d.files.records import save_garment
-from capture4d.runs.stage import Stage, open_stage, require_complete
+from capture4d.runs.stage import Stage, StageResult, open_stage, require_complete
 from capture4d.runs.workers import run_jobs
 from capture4d.types import Body, Garment, PoseSequence
 from registration.config import RegistrationConfig
@@ -72,8 +72,8 @@ def run(
     body_folder: Path | None = None,
     workers: int = 1,
     overwrite: bool = False,
-) -> str:
-    """Register the template to every frame that has none yet; the digest of the result.
+) -> StageResult:
+    """Register the template to every frame that has none yet.
 
     Args:
         body_folder: tracked body to move the template with; None takes the poses that the capture brings.

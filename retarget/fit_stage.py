@@ -29,7 +29,7 @@ from capture4d.captures.work_folder import VERDICTS, load_moving_body, load_reco
 from capture4d.errors import InputError
 from capture4d.files.atomic import read_json, write_json, write_npy, write_npy_rows
 from capture4d.files.records import load_garment, save_body
-from capture4d.runs.stage import Stage, open_stage, require_complete
+from capture4d.runs.stage import Stage, StageResult, open_stage, require_complete
 from capture4d.runs.workers import run_jobs
 from capture4d.types import BlendshapeModel, Body, PoseSequence
 from retarget.config import FitConfig, check_fit
@@ -73,8 +73,8 @@ def run(
     device: str = "cpu",
     workers: int = 1,
     overwrite: bool = False,
-) -> str:
-    """Learn a garment from registered takes; the digest of the result.
+) -> StageResult:
+    """Learn a garment from registered takes.
 
     Args:
         works: work folders, each with a finished registration/, in any order. Their names are the takes' names.
@@ -127,10 +127,10 @@ def _files(config: FitConfig) -> list[str]:
     return ["body.npz", MODEL, LINEAR, POSES, *([KERNEL] if kernel else []), *([LSTM] if network else [])]
 
 
-def _finish(stage: Stage, config: FitConfig) -> str:
-    digest = stage.finish([stage.path / name for name in _files(config)])
+def _finish(stage: Stage, config: FitConfig) -> StageResult:
+    result = stage.finish([stage.path / name for name in _files(config)])
     shutil.rmtree(stage.path / "unposed", ignore_errors=True)
-    return digest
+    return result
 
 
 # --- takes -------------------------------------------------------------------------------------------------------

@@ -26,7 +26,7 @@ from capture4d.errors import InputError
 from capture4d.extraction.garment import ColourNotFoundError, cut_out
 from capture4d.files.arrays import ArrayFile
 from capture4d.files.atomic import write_json, write_npz
-from capture4d.runs.stage import Stage, open_stage
+from capture4d.runs.stage import Stage, StageResult, open_stage
 from capture4d.runs.workers import run_jobs
 from capture4d.types import GarmentScan
 
@@ -43,8 +43,10 @@ class ExtractionSettings:
     learn_colours: bool = False
 
 
-def run(capture: Path, output: Path, *, learn_colours: bool = False, workers: int = 1, overwrite: bool = False) -> str:
-    """Extract the garment of every frame that has none yet; the digest of the result.
+def run(
+    capture: Path, output: Path, *, learn_colours: bool = False, workers: int = 1, overwrite: bool = False
+) -> StageResult:
+    """Extract the garment of every frame that has none yet.
 
     Args:
         learn_colours: learn all colours from the scans, not only those that capture.json leaves open.

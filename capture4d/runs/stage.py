@@ -11,16 +11,35 @@ import json
 import os
 import shutil
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from capture4d.errors import InputError, StaleError
 from capture4d.files.atomic import TEMPORARY_SUFFIX, file_digest, plain_value, read_json, write_json
 
-__all__ = ["Stage", "open_stage", "require_complete"]
+__all__ = ["Stage", "StageResult", "open_stage", "require_complete"]
+
+
+@dataclass(frozen=True, slots=True)
+class StageResult:
+    """What every stage returns: where its output lies, and how many of its frames failed."""
+
+    path: Path
+    """What a user opens or hands on: the stage's folder, or the one file that it is about."""
+    digest: str
+    """Of the output; equal for equal results."""
+    frames: int = 0
+    """Of the take; 0 where the stage does not go by frames."""
+    failed: Mapping[int, str] = field(default_factory=dict)
+    """Frames without a usable result, and why."""
+
+    @property
+    def failed_percent(self) -> float:
+        return 100 * len(self.failed) / max(self.frames, 1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,10 +55,6 @@ class Stage:
     def was_complete(self) -> bool:
         """An earlier run with these settings and inputs has finished."""
         return self._earlier is not None
-
-    @property
-    def frames_folder(self) -> Path:
-        return self.path / "frames"
 
     def frame_path(self, frame_id: int, suffix: str = ".npz", *, folder: str = "frames") -> Path:
         """Where a frame's file goes: `<stage>/<folder>/000123<suffix>`."""
@@ -57,25 +72,36 @@ class Stage:
         except FileNotFoundError:
             return 0
 
-    def finish(self, paths: Iterable[Path], *, changed: bool = True) -> str:
-        """Mark the stage complete and return its digest, over the names and contents of `paths`.
+    def finish(
+        self,
+        paths: Iterable[Path],
+        *,
+        changed: bool = True,
+        output: Path | None = None,
+        frames: int = 0,
+        failed: Mapping[int, str] | None = None,
+    ) -> StageResult:
+        """Mark the stage complete. Its digest is over the names and contents of `paths`.
 
         Leave out of `paths` what differs between equal runs, such as times.
 
         Args:
             changed: False if nothing was written since the stage was opened: if it was complete then, its digest is
                 not computed again.
+            output: what a user opens; the folder if None.
+            frames: of the take, and `failed`, those of them without a usable result, with the reason.
         """
         paths = list(paths)
+        result = partial(StageResult, output or self.path, frames=frames, failed=failed or {})
         if self._earlier is not None and not changed and all(path.is_file() for path in paths):
             write_json(self.path / "stage.json", {**self._earlier, "sources": self._record["sources"]})
-            return self._earlier["digest"]
+            return result(digest=self._earlier["digest"])
         for leftover in self.path.rglob(f".*{TEMPORARY_SUFFIX}"):
             leftover.unlink(missing_ok=True)
         digest = file_digest(paths, root=self.path)
         finished = {**self._record, "status": "complete", "digest": digest, "finished": _now()}
         write_json(self.path / "stage.json", finished)
-        return digest
+        return result(digest=digest)
 
 
 def open_stage(
@@ -87,6 +113,7 @@ def open_stage(
     upstream: Mapping[str, str],
     sources: Mapping[str, Path] | None = None,
     formerly: Mapping[str, str] | None = None,
+    former_names: Sequence[str] = (),
     overwrite: bool = False,
 ) -> Stage:
     """Open an output folder, new or to be continued.
@@ -98,6 +125,7 @@ def open_stage(
         upstream: digest of each input, by name.
         sources: where the inputs lie, for later stages and for people. Inputs may be moved, so this decides nothing.
         formerly: an earlier `upstream` whose results still hold; a folder that was made from it is taken over.
+        former_names: that the stage has had; folders that bear one are its own.
         overwrite: start clean; deletes everything in the folder, if it is this stage's.
     Raises:
         InputError: the folder holds something else.
@@ -112,12 +140,14 @@ def open_stage(
         "upstream": dict(upstream),
     }
     if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder}: expected a folder to write to, found a file")
+        raise InputError("expected a folder to write to, found a file", where=folder)
     existing = read_json(record_path) if record_path.exists() else None
+    if existing is not None and existing.get("stage") in former_names:
+        existing = {**existing, "stage": name}
     if existing is None and folder.is_dir() and not _is_blank(folder):
-        raise InputError(f"{folder}: expected an empty folder or an earlier run of '{name}', found other files")
+        raise InputError(f"expected an empty folder or an earlier run of '{name}', found other files", where=folder)
     if existing is not None and existing.get("stage") != name:
-        raise InputError(f"{folder}: expected output of '{name}', found output of '{existing.get('stage')}'")
+        raise InputError(f"expected output of '{name}', found output of '{existing.get('stage')}'", where=folder)
 
     if existing is not None and (overwrite or existing.get("status") == "discarded"):
         _discard(folder, existing)
@@ -127,7 +157,7 @@ def open_stage(
     if existing is not None:
         changed = list(_differences(settings, existing))
         if changed:
-            raise StaleError(f"{folder}: was made with other settings ({'; '.join(changed[:3])}); use --overwrite")
+            raise StaleError(f"was made with other settings ({'; '.join(changed[:3])}); use --overwrite", where=folder)
         started = existing.get("started", _now())
     else:
         started = _now()
@@ -138,28 +168,37 @@ def open_stage(
     return Stage(folder, record, existing if existing and existing.get("status") == "complete" else None)
 
 
-def require_complete(folder: str | Path, name: str, command: str, *, made_from: Mapping[str, str] | None = None) -> str:
+def require_complete(
+    folder: str | Path,
+    name: str,
+    command: str,
+    *,
+    made_from: Mapping[str, str] | None = None,
+    former_names: Sequence[str] = (),
+) -> str:
     """The digest of a finished stage.
 
     Args:
         made_from: digests of inputs that it has to have been made from, by name.
+        former_names: that the stage has had.
     Raises:
         InputError: it is missing or unfinished; the message names `command`, which repairs that.
         StaleError: it was made from something else.
     """
     folder = Path(folder)
     if not (folder / "stage.json").is_file():
-        raise InputError(f"{folder}: expected the output of '{name}', found none; run: {command}")
+        raise InputError(f"expected the output of '{name}', found none; run: {command}", where=folder)
     record = read_json(folder / "stage.json")
-    if record.get("stage") != name:
-        raise InputError(f"{folder}: expected the output of '{name}', found output of '{record.get('stage')}'")
+    if record.get("stage") not in (name, *former_names):
+        raise InputError(f"expected the output of '{name}', found output of '{record.get('stage')}'", where=folder)
     if record.get("status") != "complete":
-        raise InputError(f"{folder}: '{name}' is not finished; run: {command}")
+        raise InputError(f"'{name}' is not finished; run: {command}", where=folder)
     for key, digest in (made_from or {}).items():
         if record.get("upstream", {}).get(key) != digest:
             raise StaleError(
-                f"{folder}: expected the output of '{name}' from this {key} as it is now, found that of another or of "
-                f"an earlier state; run: {command} --overwrite"
+                f"expected the output of '{name}' from this {key} as it is now, found that of another or of an earlier "
+                f"state; run: {command} --overwrite",
+                where=folder,
             )
     return record["digest"]
 

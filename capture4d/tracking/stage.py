@@ -39,7 +39,7 @@ from capture4d.errors import InputError
 from capture4d.files.arrays import ArrayFile
 from capture4d.files.atomic import file_digest, read_json, write_bytes, write_json, write_npz
 from capture4d.files.records import load_body, save_body, save_poses
-from capture4d.runs.stage import Stage, open_stage
+from capture4d.runs.stage import Stage, StageResult, open_stage
 from capture4d.runs.workers import run_jobs
 from capture4d.tracking.config import SequenceConfig, TrackingConfig
 from capture4d.tracking.limbs import guessed_limbs, unseen_limbs
@@ -55,8 +55,10 @@ SCHEMA = 4
 STARTS = ("search", "rest")
 
 
-def run(capture: Path, output: Path, config: TrackingConfig, *, workers: int = 1, overwrite: bool = False) -> str:
-    """Track the body through every frame; the digest of the result.
+def run(
+    capture: Path, output: Path, config: TrackingConfig, *, workers: int = 1, overwrite: bool = False
+) -> StageResult:
+    """Track the body through every frame.
 
     Raises:
         InputError: the capture is damaged, none of its scans can be read, or the start is no pose of its body.

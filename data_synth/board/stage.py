@@ -13,7 +13,7 @@ from capture4d.cameras.board import Board, parse_board
 from capture4d.errors import InputError
 from capture4d.files.atomic import file_digest, write_bytes
 from capture4d.files.records import load_rig
-from capture4d.runs.stage import open_stage
+from capture4d.runs.stage import StageResult, open_stage
 from capture4d.runs.workers import run_jobs
 from capture4d.types import Rig
 from data_synth.board.images import photograph_board
@@ -44,7 +44,7 @@ class _Job:
         return self.images / self.rig.names[camera] / f"{self.pose + 1:03d}.png"
 
 
-def run(rig_path: Path, images: Path, config: BoardConfig, *, workers: int = 1, overwrite: bool = False) -> str:
+def run(rig_path: Path, images: Path, config: BoardConfig, *, workers: int = 1, overwrite: bool = False) -> StageResult:
     """Photograph a board in the middle of a rig, as `images`/CAMERA/POSE.png; the digest of the images.
 
     A camera gets no image of a pose that it does not see.

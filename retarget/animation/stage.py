@@ -25,7 +25,7 @@ from capture4d.captures.work_folder import ANIMATE, VERDICTS, stack_vertices
 from capture4d.errors import InputError
 from capture4d.files.atomic import file_digest, read_json, write_bytes, write_json, write_npy, write_npz
 from capture4d.files.records import load_body, load_poses, save_body, save_garment, save_poses
-from capture4d.runs.stage import Stage, open_stage
+from capture4d.runs.stage import Stage, StageResult, open_stage
 from capture4d.runs.workers import run_jobs
 from capture4d.types import Body, PoseSequence
 from retarget.animation.animator import AnimatedFrame, Animator
@@ -62,8 +62,8 @@ def run(
     device: str = "cpu",
     workers: int = 1,
     overwrite: bool = False,
-) -> str:
-    """Animate a garment; the digest of the registered sequence.
+) -> StageResult:
+    """Animate a garment.
 
     Args:
         model: what `fit` wrote.
@@ -234,7 +234,7 @@ def _write_frame(stage: Stage, frame_id: int, frame: AnimatedFrame, distance_deg
     )
 
 
-def _collect(stage: Stage, frame_ids: Sequence[int]) -> str:
+def _collect(stage: Stage, frame_ids: Sequence[int]) -> StageResult:
     stack_vertices(stage, frame_ids)
     records = [read_json(stage.frame_path(frame_id, ".json", folder="metrics")) for frame_id in frame_ids]
     write_bytes(stage.path / "metrics.jsonl", "".join(json.dumps(each) + "\n" for each in records).encode())

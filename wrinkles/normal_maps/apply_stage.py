@@ -22,7 +22,7 @@ from capture4d.errors import InputError
 from capture4d.files.atomic import file_digest, write_bytes, write_npy
 from capture4d.files.records import save_garment
 from capture4d.geometry.tangents import corner_tangents
-from capture4d.runs.stage import Stage, open_stage
+from capture4d.runs.stage import Stage, StageResult, open_stage
 from capture4d.runs.workers import run_jobs
 from wrinkles.normal_maps.inference import WrinkleModel, load_model
 from wrinkles.normal_maps.pair_files import layout_digest
@@ -52,8 +52,8 @@ class _Chunk:
     positions: range
 
 
-def run(model: Path, work: Path, config: ApplyConfig, *, workers: int = 1, overwrite: bool = False) -> str:
-    """Make the map of every registered frame that has none yet; the digest of the result.
+def run(model: Path, work: Path, config: ApplyConfig, *, workers: int = 1, overwrite: bool = False) -> StageResult:
+    """Make the map of every registered frame that has none yet.
 
     Raises:
         InputError: there is no registration, no usable model, or the model was trained on another template's UVs.

@@ -25,7 +25,7 @@ from capture4d.captures.work_folder import failed_frames, load_registration, reg
 from capture4d.errors import InputError
 from capture4d.files.atomic import read_json, write_bytes, write_json
 from capture4d.files.records import load_garment, save_garment
-from capture4d.runs.stage import Stage, open_stage, require_complete
+from capture4d.runs.stage import Stage, StageResult, open_stage, require_complete
 from capture4d.runs.workers import run_jobs
 from capture4d.types import Mesh, RegisteredSequence
 from wrinkles.normal_maps.config import PairConfig
@@ -50,8 +50,8 @@ class _Run:
 
 def run(
     work: Path, config: PairConfig, *, high_from: Path | None = None, workers: int = 1, overwrite: bool = False
-) -> str:
-    """Make the pair of every frame that has none yet; the digest of the result.
+) -> StageResult:
+    """Make the pair of every frame that has none yet.
 
     Args:
         high_from: a work folder with finished pairs of the same frames, whose high maps are taken.
@@ -88,7 +88,7 @@ def run(
     return stage.finish([output / "template.npz", *maps])
 
 
-def _borrow(work: Path, lender: Path, config: PairConfig, *, overwrite: bool) -> str:
+def _borrow(work: Path, lender: Path, config: PairConfig, *, overwrite: bool) -> StageResult:
     """Pairs of this sequence's low maps with another's high maps; the frames that both have."""
     pairs, upstream = lender / "wrinkles" / "pairs", _lent(work, lender)
     sequence, theirs = load_registration(work / "registration"), load_registration(lender / "registration")

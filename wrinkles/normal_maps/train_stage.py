@@ -25,7 +25,7 @@ from capture4d.captures.work_folder import registered_digest
 from capture4d.errors import InputError
 from capture4d.files.atomic import read_json, read_json_lines, write_bytes, write_json
 from capture4d.geometry.uv_layout import millimetres_per_texel
-from capture4d.runs.stage import Stage, open_stage, require_complete
+from capture4d.runs.stage import Stage, StageResult, open_stage, require_complete
 from capture4d.runs.workers import progress
 from capture4d.types import Mesh
 from wrinkles.normal_maps.config import PairConfig, WrinkleConfig
@@ -56,8 +56,8 @@ def run(
     pairs: PairConfig | None = None,
     workers: int = 1,
     overwrite: bool = False,
-) -> str:
-    """Make the pairs that are missing, train, measure; the digest of the result.
+) -> StageResult:
+    """Make the pairs that are missing, train, measure.
 
     Pairs that are there are used as they are, unless `pairs` asks for other than the default.
 

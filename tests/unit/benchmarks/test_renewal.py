@@ -13,7 +13,7 @@ def make(folder: Path, settings: dict[str, int], *, stage: str = "test", overwri
     path = folder / "value.txt"
     if not path.is_file():
         path.write_text(str(settings["value"]))
-    return opened.finish([path])
+    return opened.finish([path]).digest
 
 
 def test_what_other_settings_made_is_made_anew(tmp_path: Path):

@@ -138,7 +138,7 @@ def write_work(make_world):
         tracked = open_stage(work / "body", name="track", schema=1, config={}, upstream={})
         save_body(tracked.path / "body.npz", world.body)
         save_poses(tracked.path / "poses.npz", poses)
-        upstream = {"body": tracked.finish([tracked.path / "poses.npz"]), "garment": work.name}
+        upstream = {"body": tracked.finish([tracked.path / "poses.npz"]).digest, "garment": work.name}
         stage = open_stage(work / "registration", name=REGISTER, schema=1, config={}, upstream=upstream)
         save_garment(stage.path / "garment.npz", registered.garment)
         records = []

@@ -42,7 +42,7 @@ def open_test_stage(folder: Path, settings: Settings | None = None, *, garment: 
 def finish_frames(stage: Stage) -> str:
     for frame_id in stage.pending(FRAMES):
         write_npz(stage.frame_path(frame_id), value=np.full(5, frame_id))
-    return stage.finish([stage.frame_path(frame_id) for frame_id in FRAMES])
+    return stage.finish([stage.frame_path(frame_id) for frame_id in FRAMES]).digest
 
 
 # --- files
@@ -130,9 +130,9 @@ def test_a_complete_stage_is_not_hashed_again_unless_something_was_written(tmp_p
     write_npz(paths[0], value=np.zeros(1))  # behind its back
     again = open_test_stage(tmp_path)
     assert again.was_complete
-    assert again.finish(paths, changed=False) == digest
+    assert again.finish(paths, changed=False).digest == digest
     assert require_complete(tmp_path, "test", "make") == digest
-    assert open_test_stage(tmp_path).finish(paths) != digest
+    assert open_test_stage(tmp_path).finish(paths).digest != digest
     open_test_stage(tmp_path)  # and is killed
     assert not open_test_stage(tmp_path).was_complete
 
@@ -226,10 +226,10 @@ def test_a_stage_never_touches_a_folder_of_something_else(tmp_path: Path):
 
 def test_finishing_removes_what_killed_writers_left(tmp_path: Path):
     stage = open_test_stage(tmp_path)
-    stage.frames_folder.mkdir()
-    (stage.frames_folder / ".000003.npz.abc.partial").write_bytes(b"half")
+    (stage.path / "frames").mkdir()
+    ((stage.path / "frames") / ".000003.npz.abc.partial").write_bytes(b"half")
     finish_frames(stage)
-    assert not list(stage.frames_folder.glob(".*"))
+    assert not list((stage.path / "frames").glob(".*"))
 
 
 def test_an_unfinished_stage_names_the_command_that_finishes_it(tmp_path: Path):

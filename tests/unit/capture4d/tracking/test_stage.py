@@ -70,7 +70,7 @@ def test_a_take_is_tracked_and_a_run_that_was_cut_short_ends_the_same(tmp_path: 
     truth = dressed_capture(tmp_path / "capture", 4)
     save_poses(tmp_path / "start.npz", truth)
     config = TrackingConfig(start=str(tmp_path / "start.npz"))
-    digest = run(tmp_path / "capture", tmp_path / "work" / "body", config)
+    digest = run(tmp_path / "capture", tmp_path / "work" / "body", config).digest
     body, found = load_tracking(tmp_path / "work" / "body")
     assert found.frame_ids.tolist() == [5, 6, 7, 8]
     here, there = with_shape(body, found.shape), with_shape(body, truth.shape)
@@ -82,7 +82,7 @@ def test_a_take_is_tracked_and_a_run_that_was_cut_short_ends_the_same(tmp_path: 
 
     (tmp_path / "work" / "body" / "frames" / "000008.npz").unlink()
     (tmp_path / "work" / "body" / "refined" / "000006.npz").unlink()
-    assert run(tmp_path / "capture", tmp_path / "work" / "body", config) == digest
+    assert run(tmp_path / "capture", tmp_path / "work" / "body", config).digest == digest
     assert tracking_digest(tmp_path / "work" / "body", tmp_path / "capture") == digest
 
 
