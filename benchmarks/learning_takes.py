@@ -11,13 +11,13 @@ import numpy as np
 
 from benchmarks.cached_takes import cached_training_set
 from benchmarks.renewal import renew
-from capture4d.app.pipeline import run_stages
 from capture4d.body.skinning import ShapedBody, with_shape
 from capture4d.captures.capture import Capture, read_body, read_capture, read_template
 from capture4d.captures.truth import read_truth_model, read_truth_vertices
 from capture4d.captures.work_folder import load_moving_body, load_records, load_registration
 from capture4d.evaluation import material_points
 from capture4d.files.records import load_poses
+from capture4d.pipeline import run_stages
 from capture4d.types import Garment, PoseSequence, RegisteredSequence
 from data_synth.config import TRAINING_SETS, TrainingSetConfig
 from registration.config import RegistrationConfig

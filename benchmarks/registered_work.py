@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 
 from benchmarks.cached_takes import cached_take
 from benchmarks.renewal import renew
-from capture4d.app.pipeline import run_stages
+from capture4d.pipeline import run_stages
 from capture4d.runs.cache import user_cache_folder
 from data_synth.config import PRESETS, SynthConfig
 from registration.config import RegistrationConfig

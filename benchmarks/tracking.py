@@ -380,7 +380,7 @@ def _without_poses(capture: Capture, folder: Path) -> Path:
 
 
 def _register(capture: Path, work: Path, *, tracked: bool) -> dict[str, float]:
-    from capture4d.app.pipeline import run_report
+    from capture4d.pipeline import run_report
     from registration.config import RegistrationConfig
     from registration.stage import run as register
 

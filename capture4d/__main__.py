@@ -1,6 +1,6 @@
 """`python -m capture4d` is the `capture4d` command."""
 
-from capture4d.app.cli import main
+from capture4d.cli.main import main
 
 if __name__ == "__main__":
     main()

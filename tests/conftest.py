@@ -10,7 +10,7 @@ import pytest
 
 _ROOT = Path(__file__).parents[1]
 # tyro puts its own placeholders into the fields of a command that are still to be given.
-_UNCHECKED = ("capture4d.app.cli", "capture4d.app.commands.")
+_UNCHECKED = "capture4d.cli."
 
 
 def _install_shape_checks() -> None:

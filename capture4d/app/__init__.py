@@ -1,1 +1,1 @@
-"""The composition root: command line, pipeline, report and pictures."""
+"""Pages, pictures and figures: what people see of a work folder."""

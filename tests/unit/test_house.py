@@ -30,12 +30,12 @@ def test_every_wing_is_protected():
     protected = {
         name for contract in contracts if contract["type"] == "protected" for name in contract["protected_modules"]
     }
-    assert protected == {"capture4d.app", "data_synth", "registration", "retarget", "wrinkles"}
+    assert protected == {"capture4d.cli", "capture4d.app", "data_synth", "registration", "retarget", "wrinkles"}
 
 
 def test_settings_import_the_standard_library_only():
     script = (
-        "import sys, capture4d.app.cli\n"
+        "import sys, capture4d.cli.main\n"
         "heavy = {'numpy', 'torch', 'open3d', 'numba', 'warp', 'trimesh', 'jaxtyping'} & set(sys.modules)\n"
         "sys.exit(f'loaded {heavy}' if heavy else 0)"
     )

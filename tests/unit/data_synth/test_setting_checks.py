@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from capture4d.app.cli import main
+from capture4d.cli.main import main
 from capture4d.errors import InputError
 from data_synth.config import PRESETS, TRAINING_SETS
 from data_synth.setting_checks import check_synth

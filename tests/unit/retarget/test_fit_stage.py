@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture4d.app.cli import main
 from capture4d.body.skinning import pose_frame, skin, with_shape
 from capture4d.captures.work_folder import load_moving_body, load_records, load_registration
+from capture4d.cli.main import main
 from capture4d.errors import InputError
 from capture4d.files.atomic import read_json, write_json
 from capture4d.files.records import load_body, save_body, save_garment, save_poses

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from benchmarks.simulated_views import calibration_rig
-from capture4d.app.cli import main
 from capture4d.calibration import stage as calibration_stage
 from capture4d.calibration.adjustment import RigEstimate
 from capture4d.calibration.report import rig_difference
 from capture4d.calibration.stage import find_images
 from capture4d.cameras.board import parse_board
 from capture4d.cameras.projection import rotation_from_vector
+from capture4d.cli.main import main
 from capture4d.errors import InputError
 from capture4d.files.records import load_rig, save_rig
 from data_synth.board.images import photograph_board

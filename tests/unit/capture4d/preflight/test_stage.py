@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from capture4d.app.cli import main
 from capture4d.body.anny import load_anny
 from capture4d.body.motion_retarget import pose_sequence
 from capture4d.body.skinning import pose_frame, with_shape
 from capture4d.captures.placement import Placement, place, place_rig
+from capture4d.cli.main import main
 from capture4d.colours.spaces import to_lab
 from capture4d.files.atomic import write_json
 from capture4d.files.meshes import read_coloured_mesh, read_mesh, write_mesh

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture4d.app.cli import main
 from capture4d.body.anny import load_anny
 from capture4d.body.skinning import PosedBody, ShapedBody, pose_frame, with_pose, with_shape
+from capture4d.cli.main import main
 from capture4d.errors import InputError
 from capture4d.files.meshes import write_mesh
 from capture4d.files.records import load_garment, save_body, save_poses

@@ -16,7 +16,7 @@ import safetensors.torch
 import torch
 from scipy.spatial.transform import Rotation
 
-from capture4d.app.cli import main
+from capture4d.cli.main import main
 from capture4d.files.atomic import write_bytes, write_npy, write_npz
 from capture4d.files.records import load_garment, save_garment
 from capture4d.geometry.mesh import submesh

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture4d.app.cli import main
 from capture4d.app.compare.garment import model_take
 from capture4d.body.binding import bind
 from capture4d.captures.capture import write_scan
 from capture4d.captures.work_folder import load_moving_body, load_registration
+from capture4d.cli.main import main
 from capture4d.errors import InputError
 from capture4d.files.records import save_body, save_poses
 from capture4d.types import PoseSequence, Scan

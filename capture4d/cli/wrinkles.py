@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from capture4d.app.commands.options import StageOptions, all_cores
 from capture4d.app.compare.config import CompareConfig
+from capture4d.cli.options import StageOptions, all_cores
 from wrinkles.normal_maps import config as wrinkle_config
 from wrinkles.normal_maps.config import PairConfig, WrinkleConfig
 

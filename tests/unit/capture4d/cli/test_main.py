@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture4d.app.cli import main
 from capture4d.captures.garment_scans import load_garment_scan
+from capture4d.cli.main import main
 from capture4d.errors import InputError
 from capture4d.files.atomic import write_bytes, write_json
 from capture4d.files.meshes import read_mesh, write_mesh
@@ -65,7 +65,7 @@ def work(tmp_path: Path) -> Path:
 
 def test_help_names_every_command_and_loads_nothing_heavy():
     script = (
-        "import sys; from capture4d.app.cli import main\n"
+        "import sys; from capture4d.cli.main import main\n"
         "try: main(['--help'])\n"
         "except SystemExit as end: code = end.code\n"
         "heavy = {'numpy', 'scipy', 'torch', 'open3d', 'numba', 'warp', 'newton', 'trimesh'} & set(sys.modules)\n"
@@ -415,7 +415,7 @@ def test_register_mesh_keeps_the_templates_faces_and_measures(
 def test_the_report_gates(
     limits: list[str], code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    from capture4d.app import pipeline
+    from capture4d import pipeline
 
     values = {"fit_mean_mm": 0.7, "boundary_mean_mm": 2.0, "lost": None}
     write_json(

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from capture4d.app.commands.options import StageOptions
+from capture4d.cli.options import StageOptions
 from capture4d.errors import InputError
 from data_synth import config as synth_config
 from data_synth.scanner.config import ScanConfig
@@ -32,7 +32,7 @@ class Demo(StageOptions):
     """Folder for everything, the capture included."""
 
     def __call__(self) -> int:
-        from capture4d.app.pipeline import run_demo
+        from capture4d.pipeline import run_demo
 
         report, other = run_demo(self.output, workers=self.workers, overwrite=self.overwrite)
         print(f"report: {report}")

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from capture4d.app.commands.options import StageOptions
+from capture4d.cli.options import StageOptions
 from capture4d.errors import InputError
 from retarget.config import AnimateConfig, FitConfig
 

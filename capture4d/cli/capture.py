@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from capture4d.app.commands.options import all_cores
 from capture4d.calibration.config import CalibrationConfig, RigCheckConfig
+from capture4d.cli.options import all_cores
 
 __all__ = ["Calibrate", "Check", "CheckRig"]
 

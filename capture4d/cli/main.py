@@ -16,12 +16,12 @@ from typing import Any, NoReturn
 
 import tyro
 
-from capture4d.app.commands.capture import Calibrate, Check, CheckRig
-from capture4d.app.commands.files import ConvertBody, ConvertPoses, ConvertRig, RegisterMesh, Template
-from capture4d.app.commands.models import Animate, Fit
-from capture4d.app.commands.stages import Extract, Register, Report, Run, Track
-from capture4d.app.commands.synthesis import Demo, Scan, Synth, SynthBoard
-from capture4d.app.commands.wrinkles import Compare, WrinklesApply, WrinklesMaps, WrinklesTrain
+from capture4d.cli.capture import Calibrate, Check, CheckRig
+from capture4d.cli.files import ConvertBody, ConvertPoses, ConvertRig, RegisterMesh, Template
+from capture4d.cli.models import Animate, Fit
+from capture4d.cli.stages import Extract, Register, Report, Run, Track
+from capture4d.cli.synthesis import Demo, Scan, Synth, SynthBoard
+from capture4d.cli.wrinkles import Compare, WrinklesApply, WrinklesMaps, WrinklesTrain
 from capture4d.errors import InputError
 from data_synth import config as synth_config
 from registration import config as registration_config

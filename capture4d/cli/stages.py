@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from capture4d.app.commands.options import StageOptions
+from capture4d.cli.options import StageOptions
 from capture4d.tracking.config import TrackingConfig
 from registration.config import RegistrationConfig
 
@@ -105,7 +105,7 @@ class Run(StageOptions):
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
 
     def __call__(self) -> int:
-        from capture4d.app.pipeline import run_all
+        from capture4d.pipeline import run_all
 
         report = run_all(
             self.capture,
@@ -132,7 +132,7 @@ class Report(StageOptions):
     """Capture folder, if it is not where it was when it was registered."""
 
     def __call__(self) -> int:
-        from capture4d.app.pipeline import broken_limits, parse_limits, run_report
+        from capture4d.pipeline import broken_limits, parse_limits, run_report
 
         limits = parse_limits(self.fail_above)
         page = run_report(self.work, capture=self.capture, workers=self.workers, overwrite=self.overwrite)

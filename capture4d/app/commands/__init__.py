@@ -1,1 +1,0 @@
-"""One class a command: options, help, and one call."""
