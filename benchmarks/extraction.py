@@ -22,7 +22,7 @@ from scipy.spatial import KDTree
 from benchmarks.cached_takes import cached_take
 from benchmarks.metric import Metric
 from capture4d.body.skinning import pose_frame, with_shape
-from capture4d.captures.capture import read_body, read_capture
+from capture4d.captures.capture import read_capture
 from capture4d.captures.take_colours import KnownColours
 from capture4d.captures.truth import read_truth_frame, read_truth_model
 from capture4d.colours.learning import ColoursNotSeparableError, learn_colours
@@ -141,7 +141,7 @@ class _Take:
     @staticmethod
     def load(folder: Path) -> _Take:
         capture = read_capture(folder)
-        model, body = read_truth_model(capture), read_body(capture)
+        model, body = read_truth_model(capture), capture.body
         assert model is not None
         assert body is not None
         assert body.regions is not None
@@ -151,7 +151,7 @@ class _Take:
 
     def frame(self, row: int) -> _Dressed:
         capture = read_capture(self.folder)
-        poses, body = load_poses(self.folder / "truth" / "poses.npz"), read_body(capture)
+        poses, body = load_poses(self.folder / "truth" / "poses.npz"), capture.body
         assert body is not None
         posed = pose_frame(with_shape(body, poses.shape), poses, row).vertices()
         return _Dressed(read_truth_frame(capture, capture.frame_ids[row]).vertices, posed.astype(np.float32))

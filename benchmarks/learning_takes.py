@@ -11,16 +11,15 @@ import numpy as np
 
 from benchmarks.cached_takes import cached_training_set
 from benchmarks.renewal import renew
+from capture4d import pipeline
 from capture4d.body.skinning import ShapedBody, with_shape
-from capture4d.captures.capture import Capture, read_body, read_capture, read_template
+from capture4d.captures.capture import Capture, read_capture
 from capture4d.captures.truth import read_truth_model, read_truth_vertices
 from capture4d.captures.work_folder import load_moving_body, load_records, load_registration
 from capture4d.evaluation import material_points
 from capture4d.files.records import load_poses
-from capture4d.pipeline import run_stages
 from capture4d.types import Garment, PoseSequence, RegisteredSequence
 from data_synth.config import TRAINING_SETS, TrainingSetConfig
-from registration.config import RegistrationConfig
 from retarget.config import ShapeConfig
 from retarget.regression.learning import Take, UnposedTakes
 from retarget.regression.splits import Piece, Role
@@ -65,7 +64,7 @@ def registered_takes(
     for name in names:
         works.append(folder / "works" / name)
         capture = folder / "takes" / name
-        renew(partial(run_stages, capture, works[-1], RegistrationConfig(), track=tracked, workers=workers))
+        renew(partial(pipeline.run, capture, works[-1], tracked=tracked, draw=False, workers=workers))
     return works
 
 
@@ -122,11 +121,11 @@ def _role(name: str, config: TrainingSetConfig) -> Role:
 
 def true_take(capture: Capture) -> tuple[RegisteredSequence, ShapedBody, PoseSequence, np.ndarray]:
     """A take as if it had been registered without any error, with its exact poses."""
-    body, poses = read_body(capture), load_poses(capture.path / "truth" / "poses.npz")
+    body, poses = capture.body, load_poses(capture.path / "truth" / "poses.npz")
     assert body is not None
     places = true_places(capture)
     registered = RegisteredSequence(
-        read_template(capture), places, np.zeros(places.shape[:2], np.float32), np.array(capture.frame_ids, np.int32)
+        capture.template, places, np.zeros(places.shape[:2], np.float32), np.array(capture.frame_ids, np.int32)
     )
     return registered, with_shape(body, poses.shape), poses, np.ones(len(places), bool)
 

@@ -21,7 +21,7 @@ import numpy as np
 from benchmarks.metric import Metric
 from benchmarks.registered_work import QUICK_TAKE, locate_texels, registered_work
 from capture4d.body.skinning import pose_frame, with_shape
-from capture4d.captures.capture import Capture, read_body, read_capture
+from capture4d.captures.capture import Capture, read_capture
 from capture4d.captures.garment_scans import load_garment_scan
 from capture4d.captures.truth import read_truth_frame, read_truth_model
 from capture4d.captures.work_folder import load_registration
@@ -185,7 +185,7 @@ def _seen(
     capture: Capture, frame_id: int, cloth: np.ndarray, faces: np.ndarray, points: np.ndarray, normals: np.ndarray
 ) -> np.ndarray:
     """Whether any camera has a free view of the outer side; only every RAY_STEP-th point is asked."""
-    rig, body = load_rig(capture.path / "rig.json"), read_body(capture)
+    rig, body = load_rig(capture.path / "rig.json"), capture.body
     poses = load_poses(capture.path / "truth" / "poses.npz")
     assert body is not None
     posed = pose_frame(with_shape(body, poses.shape), poses, poses.frame_ids.tolist().index(frame_id)).vertices()

@@ -11,10 +11,9 @@ from scipy.spatial import KDTree
 
 from benchmarks.cached_takes import cached_take
 from benchmarks.renewal import renew
-from capture4d.pipeline import run_stages
+from capture4d import pipeline
 from capture4d.runs.cache import user_cache_folder
 from data_synth.config import PRESETS, SynthConfig
-from registration.config import RegistrationConfig
 
 __all__ = ["QUICK_TAKE", "locate_texels", "registered_work"]
 
@@ -26,7 +25,7 @@ def registered_work(config: SynthConfig, *, workers: int) -> tuple[Path, Path]:
     """The capture of a configuration, and a work folder with its garments and registration."""
     capture = cached_take(config, workers=workers)
     work = user_cache_folder() / "works" / capture.name
-    renew(partial(run_stages, capture, work, RegistrationConfig(), workers=workers))
+    renew(partial(pipeline.run, capture, work, draw=False, workers=workers))
     return capture, work
 
 

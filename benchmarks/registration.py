@@ -29,17 +29,11 @@ from scipy.spatial import KDTree
 from benchmarks.memory import peak_rss_mb
 from benchmarks.metric import Metric
 from benchmarks.peers import PEERS, run_peer
-from capture4d.captures.capture import (
-    Capture,
-    read_body,
-    read_capture,
-    read_poses,
-    read_template,
-    write_capture_description,
-)
+from capture4d.captures.capture import Capture, read_capture, write_capture_description
 from capture4d.captures.garment_scans import load_garment_scan
 from capture4d.captures.truth import read_truth_model, read_truth_vertices
 from capture4d.evaluation import border_errors, correspondence_errors, drift_ratio, material_points, truth_distances
+from capture4d.extraction.stage import ExtractionSettings
 from capture4d.extraction.stage import run as extract
 from capture4d.files.atomic import read_json
 from capture4d.files.meshes import read_mesh
@@ -151,13 +145,13 @@ def _shared(name: str) -> Path:
 
 def _take(folder: Path, scratch: Path, compared: int, *, start: Literal["skinned", "previous"]) -> list[Metric]:
     capture = read_capture(folder)
-    extract(folder, scratch / "garment")
+    extract(capture, scratch / "garment", ExtractionSettings())
     peak_mb = _peak_rss(folder, scratch / "garment", scratch / "registration")
     third = _first_frames(capture, scratch / "short", max(2, len(capture.frame_ids) // 3))
-    extract(third, scratch / "short-garment")
+    extract(read_capture(third), scratch / "short-garment", ExtractionSettings())
     short_mb = _peak_rss(third, scratch / "short-garment", scratch / "short-registration")
     records = [read_json(path) for path in sorted((scratch / "registration" / "metrics").glob("*.json"))]
-    garment = read_template(capture)
+    garment = capture.template
 
     def load(frame_id: int) -> np.ndarray:
         with np.load(scratch / "registration" / "frames" / f"{frame_id:06d}.npz") as arrays:
@@ -188,9 +182,9 @@ def _cases(
     capture: Capture, garment_folder: Path, start: Literal["skinned", "previous"]
 ) -> Callable[[int | None], Iterator[Case]]:
     """Frames with their truth: all of a take, or so many spread over it."""
-    model, garment, config = read_truth_model(capture), read_template(capture), RegistrationConfig()
+    model, garment, config = read_truth_model(capture), capture.template, RegistrationConfig()
     assert model is not None, "these takes come with their truth"
-    mover = Mover.create(analyse_template(garment, config), read_body(capture), read_poses(capture))
+    mover = Mover.create(analyse_template(garment, config), capture.body, capture.poses)
 
     def places(fine: np.ndarray) -> np.ndarray:
         return material_points(fine, model.fine.faces, model.template_faces, model.template_barycentric)
@@ -297,7 +291,7 @@ def _peak_rss(capture: Path, garment: Path, output: Path) -> float:
 
 
 def _register_and_measure(capture: Path, garment: Path, output: Path) -> float:
-    register(capture, garment, output, RegistrationConfig(), workers=1)
+    register(read_capture(capture), garment, output, RegistrationConfig(), workers=1)
     return peak_rss_mb()
 
 

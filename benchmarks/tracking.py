@@ -35,6 +35,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.dressed_body import covered_vertices, dress_body, sample_scan
 from benchmarks.metric import Metric
+from capture4d import pipeline
 from capture4d.body.anny import load_anny
 from capture4d.body.bvh import read_bvh
 from capture4d.body.motion_files import read_motion, write_motion
@@ -42,7 +43,6 @@ from capture4d.body.motion_retarget import retarget
 from capture4d.body.skinning import PosedBody, ShapedBody, pose_frame, with_pose, with_shape
 from capture4d.captures.capture import Capture, read_capture, read_scan, write_capture_description, write_scan
 from capture4d.captures.work_folder import load_tracking
-from capture4d.extraction.stage import run as extract
 from capture4d.files.arrays import ArrayFile
 from capture4d.files.atomic import read_json
 from capture4d.files.records import load_poses, save_body, save_poses
@@ -287,7 +287,7 @@ def _scanner(body: Body, frames: int, scratch: Path, mocap: Path, seed: int) -> 
         write_scan(capture.path / "scans" / f"{frame_id:06d}.ply", scan)
     write_capture_description(capture)
     save_body(capture.path / "body.npz", body)
-    track(capture.path, scratch / "scanned-body", TrackingConfig())
+    track(capture, scratch / "scanned-body", TrackingConfig())
     _, poses = load_tracking(scratch / "scanned-body")
     rows = 4 * np.arange(frames)
     seen = replace(
@@ -380,16 +380,11 @@ def _without_poses(capture: Capture, folder: Path) -> Path:
 
 
 def _register(capture: Path, work: Path, *, tracked: bool) -> dict[str, float]:
-    from capture4d.pipeline import run_report
-    from registration.config import RegistrationConfig
-    from registration.stage import run as register
-
-    extract(capture, work / "garment")
+    pipeline.extract(capture, work)
     if tracked:
-        track(capture, work / "body", TrackingConfig())
-    body_folder = work / "body" if tracked else None
-    register(capture, work / "garment", work / "registration", RegistrationConfig(), body_folder=body_folder)
-    run_report(work, capture=capture)
+        pipeline.track(capture, work)
+    pipeline.register(capture, work, tracked=tracked)
+    pipeline.report(work, capture=capture)
     return {entry["key"]: entry["value"] for entry in read_json(work / "report" / "metrics.json")["metrics"]}
 
 

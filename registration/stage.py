@@ -14,25 +14,17 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import dataclass
-from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
 
 from capture4d.body.binding import with_body_shape
-from capture4d.captures.capture import (
-    Capture,
-    capture_digest,
-    motion_digest,
-    read_capture,
-    read_template,
-    template_digest,
-)
+from capture4d.captures.capture import Capture
 from capture4d.captures.garment_scans import load_garment_scan
 from capture4d.captures.work_folder import (
     REGISTER,
     VERDICTS,
-    captured_motion,
+    load_records,
     load_tracking,
     stack_vertices,
     tracking_digest,
@@ -41,8 +33,7 @@ from capture4d.errors import InputError
 from capture4d.files.atomic import read_json, write_bytes, write_json, write_npz
 from capture4d.files.records import save_garment
 from capture4d.runs.stage import Stage, StageResult, open_stage, require_complete
-from capture4d.runs.workers import run_jobs
-from capture4d.types import Body, Garment, PoseSequence
+from capture4d.runs.workers import run_jobs, shared
 from registration.config import RegistrationConfig
 from registration.sequence import FrameResult, Mover, register_run, segments
 from registration.template import TemplateAnalysis, analyse_template
@@ -52,19 +43,20 @@ __all__ = ["run"]
 SCHEMA = 3
 
 
-@dataclass(frozen=True, slots=True)
-class SegmentJob:
-    """A segment of the take for one worker."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Take:
+    """What all segments of a take share: the template on the person who moves it, ready to be registered."""
 
-    capture: Path
+    analysis: TemplateAnalysis
+    mover: Mover | None
+    config: RegistrationConfig
+    frame_ids: tuple[int, ...]
     garment_folder: Path
-    body_folder: Path | None
     stage: Stage
-    positions: range
 
 
 def run(
-    capture: Path,
+    capture: Capture,
     garment_folder: Path,
     output: Path,
     config: RegistrationConfig,
@@ -78,98 +70,86 @@ def run(
     Args:
         body_folder: tracked body to move the template with; None takes the poses that the capture brings.
     Raises:
-        InputError: the capture or the garments are missing or unfinished, the garments are those of another capture, or
-            poses, body and template disagree.
+        InputError: the garments are missing or unfinished, or those of another capture, or poses, body and template
+            disagree.
     """
-    description = read_capture(capture)
-    command = f"capture4d extract {capture} --output {output.parent}"
-    made_from = {"capture": capture_digest(description)}
+    command = f"capture4d extract {capture.path} --output {output.parent}"
+    made_from = {"capture": capture.digest}
     upstream = {
         "garment": require_complete(garment_folder, "extract", command, made_from=made_from),
-        "template": template_digest(description),
+        "template": capture.template_digest,
     }
     if body_folder is not None:
         upstream["body"] = tracking_digest(body_folder, capture)
-    elif digest := motion_digest(description):
-        upstream["motion"] = digest
+    elif capture.motion_digest:
+        upstream["motion"] = capture.motion_digest
     stage = open_stage(output, name=REGISTER, schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite)
-    _analysis.cache_clear()
-    garment = _template(description, body_folder)
-    if description.boundary_colours and not garment.loops:
-        raise InputError(f"{capture}: expected a template with open borders, as its scans have; found none")
+    moving = capture.posed_body if body_folder is None else load_tracking(body_folder)
+    garment = capture.template if moving is None else with_body_shape(capture.template, moving[0], moving[1].shape)
+    if capture.boundary_colours and not garment.loops:
+        raise InputError("expected a template with open borders, as its scans have; found none", where=capture.path)
     if not (output / "garment.npz").is_file():
         save_garment(output / "garment.npz", garment)
-    mover = _mover(description, body_folder, _analysis(capture, body_folder, config))
-    frame_ids = description.frame_ids
-    pending = set(stage.pending(frame_ids))
-    jobs = [
-        SegmentJob(capture, garment_folder, body_folder, stage, positions)
-        for positions in segments(mover, len(frame_ids), config.sequence)
-        if pending.intersection(frame_ids[position] for position in positions)
-    ]
-    for _ in run_jobs(
-        partial(_register_job, config), jobs, workers=workers, label="register", units=lambda job: len(job.positions),
-        finished=stage.count,
-    ):  # fmt: skip
-        pass
+    pending = set(stage.pending(capture.frame_ids))
+    if pending:
+        analysis = analyse_template(garment, config)
+        mover = None if moving is None else Mover.create(analysis, *moving)
+        take = _Take(analysis, mover, config, capture.frame_ids, garment_folder, stage)
+        jobs = _segments(take, pending)
+        for _ in run_jobs(
+            _register_segment, jobs, prepare=shared(take), workers=workers, label="register", units=len,
+            finished=stage.count,
+        ):  # fmt: skip
+            pass
     gathered = all((output / name).is_file() for name in ("vertices.npy", "metrics.jsonl"))
     changed = bool(pending) or not gathered or not stage.was_complete
     if changed:
-        _gather(stage, frame_ids)
-    frames = [stage.frame_path(frame_id) for frame_id in frame_ids]
-    return stage.finish([output / "garment.npz", output / "vertices.npy", *frames], changed=changed)
+        _gather(stage, capture.frame_ids)
+    frames = [stage.frame_path(frame_id) for frame_id in capture.frame_ids]
+    return stage.finish(
+        [output / "garment.npz", output / "vertices.npy", *frames],
+        changed=changed,
+        frames=len(frames),
+        failed={
+            record["frame_id"]: "; ".join(record["reasons"])
+            for record in load_records(output)
+            if record["verdict"] == "failed"
+        },
+    )
 
 
-def _moving(capture: Capture, body_folder: Path | None) -> tuple[Body | None, PoseSequence | None]:
-    """The body and its poses: those that were tracked, or those of the capture."""
-    if body_folder is None:
-        return captured_motion(capture)
-    return load_tracking(body_folder)
+def _segments(take: _Take, pending: set[int]) -> list[range]:
+    """Positions of frames that belong together, where any of them is still to be done."""
+    return [
+        positions
+        for positions in segments(take.mover, len(take.frame_ids), take.config.sequence)
+        if pending.intersection(take.frame_ids[position] for position in positions)
+    ]
 
 
-def _template(capture: Capture, body_folder: Path | None) -> Garment:
-    """The template on the person who moves it."""
-    garment = read_template(capture)
-    body, poses = _moving(capture, body_folder)
-    return garment if body is None or poses is None else with_body_shape(garment, body, poses.shape)
-
-
-def _mover(capture: Capture, body_folder: Path | None, analysis: TemplateAnalysis) -> Mover | None:
-    return Mover.create(analysis, *_moving(capture, body_folder))
-
-
-@lru_cache(maxsize=2)
-def _analysis(capture: Path, body_folder: Path | None, config: RegistrationConfig) -> TemplateAnalysis:
-    """One analysis per process, template and settings."""
-    return analyse_template(_template(read_capture(capture), body_folder), config)
-
-
-def _register_job(config: RegistrationConfig, job: SegmentJob) -> int:
-    """Register and write the frames of a run; how many were new."""
-    description = read_capture(job.capture)
-    frame_ids = description.frame_ids
-    analysis = _analysis(job.capture, job.body_folder, config)
-    mover = _mover(description, job.body_folder, analysis)
-    pending = set(job.stage.pending([frame_ids[position] for position in job.positions]))
+def _register_segment(take: _Take, positions: range) -> int:
+    """Register and write the frames of a segment; how many were new."""
+    frame_ids, stage = take.frame_ids, take.stage
+    pending = set(stage.pending([frame_ids[position] for position in positions]))
 
     def done(frame_id: int) -> tuple[np.ndarray, bool] | None:
         if frame_id in pending:
             return None
-        with np.load(job.stage.frame_path(frame_id), allow_pickle=False) as arrays:
+        with np.load(stage.frame_path(frame_id), allow_pickle=False) as arrays:
             return arrays["vertices"], VERDICTS[int(arrays["verdict"])] != "failed"
 
     results = register_run(
-        analysis,
-        mover,
-        job.positions,
+        take.analysis,
+        take.mover,
+        positions,
         frame_ids,
-        load=lambda frame_id: load_garment_scan(job.garment_folder / "frames" / f"{frame_id:06d}.npz", frame_id),
+        load=lambda frame_id: load_garment_scan(take.garment_folder / "frames" / f"{frame_id:06d}.npz", frame_id),
         done=done,
-        config=config,
+        config=take.config,
     )
     count = 0
     for result in results:
-        _write_frame(job.stage, result)
+        _write_frame(stage, result)
         count += 1
     return count
 

@@ -15,15 +15,17 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
+from capture4d.body.anny import load_anny
 from capture4d.colours.spaces import Colour, format_colour, parse_colour
 from capture4d.errors import InputError
-from capture4d.files.atomic import file_digest, read_json, write_json
+from capture4d.files.atomic import content_digest, file_digest, parse_json, write_json
 from capture4d.files.meshes import MESH_SUFFIXES, read_coloured_mesh, read_mesh, write_mesh
 from capture4d.files.records import (
     load_body,
@@ -37,26 +39,19 @@ from capture4d.types import Body, Garment, PoseSequence, Rig, Scan
 __all__ = [
     "METRES",
     "Capture",
+    "CaptureFiles",
     "Units",
-    "body_digest",
     "capture_digest",
-    "motion_digest",
-    "read_body",
     "read_capture",
-    "read_poses",
-    "read_rig",
     "read_scan",
-    "read_template",
     "scan_digest",
     "scan_path",
-    "template_digest",
     "template_path",
     "write_capture_description",
     "write_scan",
 ]
 
 _FORMAT = 1
-
 
 Units = Literal["m", "cm", "mm", "in"]
 
@@ -69,12 +64,30 @@ TEXTURE_SUFFIXES = (".mtl", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 """What may lie beside the scans and colour them."""
 
 
+SCAN_SUFFIXES = (".ply", ".glb", ".obj")
+
 _END = 65_536
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class CaptureFiles:
+    """What a capture folder held when it was opened."""
+
+    description: bytes
+    """Of capture.json."""
+    scans: Mapping[int, Path]
+    """By frame number."""
+    textures: tuple[Path, ...]
+    """Beside the scans, by name."""
+
+
+@dataclass(frozen=True, eq=False)
 class Capture:
-    """A take: the description of a capture folder. Scans are read one by one, with `read_scan`."""
+    """A take: the description of a capture folder, as it was when it was opened.
+
+    What else the folder holds is read when it is first asked for, and once. Scans are read one by one, with
+    `read_scan`.
+    """
 
     path: Path
     name: str
@@ -88,18 +101,98 @@ class Capture:
     colour is to be learned, those that are found."""
     units: Units = "m"
     """Of the scan files. What `read_scan` returns is in metres."""
+    files: CaptureFiles | None = None
+    """None for a capture that was not read from a folder: its files are looked up when they are asked for."""
 
     def __post_init__(self) -> None:
         if not self.frame_ids:
-            raise InputError(f"{self.path}: expected at least one frame, found none")
+            raise InputError("expected at least one frame, found none", where=self.path)
         if not self.fps > 0:
-            raise InputError(f"{self.path}: expected a positive frame rate, found {self.fps}")
+            raise InputError(f"expected a positive frame rate, found {self.fps}", where=self.path)
         if list(self.frame_ids) != sorted(set(self.frame_ids)) or self.frame_ids[0] < 0:
-            raise InputError(f"{self.path}: expected ascending frame numbers, each once and none negative")
+            raise InputError("expected ascending frame numbers, each once and none negative", where=self.path)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What travels to another process: not what was read of the folder, which is read there if it is needed."""
+        return {entry.name: getattr(self, entry.name) for entry in fields(self)}
 
     def time_s(self, frame_id: int) -> float:
         """Time of a frame since the first."""
         return (frame_id - self.frame_ids[0]) / self.fps
+
+    @cached_property
+    def digest(self) -> str:
+        """Of the description and the scans, which every stage starts from."""
+        return capture_digest(self)
+
+    @cached_property
+    def template(self) -> Garment:
+        """The garment to register: `template.npz`, or a bare mesh `template.obj` with loops called border_0, ...
+
+        Raises:
+            InputError: there is neither.
+        """
+        path, data = self._template_file
+        if path.suffix == ".npz":
+            return load_garment(path, data)
+        mesh = read_mesh(path).mesh
+        if self.units != "m":
+            mesh = mesh.with_vertices(mesh.vertices * np.float32(METRES[self.units]))
+        return Garment(mesh, {f"border_{index}": loop for index, loop in enumerate(boundary_loops(mesh.faces))})
+
+    @property
+    def template_digest(self) -> str:
+        """Raises InputError where there is no template."""
+        path, data = self._template_file
+        return content_digest({path.name: data})
+
+    @cached_property
+    def _template_file(self) -> tuple[Path, bytes]:
+        path = template_path(self)
+        return path, path.read_bytes()
+
+    @cached_property
+    def poses(self) -> PoseSequence | None:
+        """The poses of the take, one per scan and in their order; None if the capture has none.
+
+        Raises:
+            InputError: a scan has no pose.
+        """
+        return _poses(self)
+
+    @cached_property
+    def body(self) -> Body | None:
+        """The body that `body.npz` brings."""
+        path = self.path / "body.npz"
+        return load_body(path) if path.is_file() else None
+
+    @cached_property
+    def posed_body(self) -> tuple[Body, PoseSequence] | None:
+        """The body and its poses, of the built-in body where poses come without one; None without poses.
+
+        Raises:
+            InputError: a scan has no pose.
+        """
+        return None if self.poses is None else (self.body or load_anny(), self.poses)
+
+    @cached_property
+    def rig(self) -> Rig | None:
+        path = self.path / "rig.json"
+        return load_rig(path) if path.is_file() else None
+
+    @cached_property
+    def body_digest(self) -> str | None:
+        """None where the capture brings no body."""
+        path = self.path / "body.npz"
+        return file_digest([path], root=self.path) if path.is_file() else None
+
+    @cached_property
+    def motion_digest(self) -> str | None:
+        """Of the poses and of the body they move; None where the capture brings no poses."""
+        if not (self.path / "poses.npz").is_file():
+            return None
+        paths = [self.path / name for name in ("poses.npz", "body.npz")]
+        return file_digest([path for path in paths if path.is_file()], root=self.path)
 
 
 # --- description and scans ---------------------------------------------------------------------------------------
@@ -127,11 +220,11 @@ def read_capture(path: str | Path, *, scans: bool = True) -> Capture:
     path = Path(path)
     description = path / "capture.json"
     if not path.is_dir():
-        raise InputError(f"{path}: no such capture folder")
+        raise InputError("no such capture folder", where=path)
     if not description.is_file():
-        raise InputError(f"{description}: no such file; a capture folder needs one (see docs/conventions.md)")
-    found = read_json(description)
-    present = _scan_numbers(path)
+        raise InputError("no such file; a capture folder needs one (see docs/conventions.md)", where=description)
+    files = _list_files(path)
+    found = parse_json(files.description, description)
     try:
         if found.get("format") != _FORMAT:
             raise InputError(f"expected format {_FORMAT}, found {found.get('format')}")
@@ -139,24 +232,40 @@ def read_capture(path: str | Path, *, scans: bool = True) -> Capture:
             path=path,
             name=str(found.get("name", path.resolve().name)),
             fps=float(found["fps"]),
-            frame_ids=tuple(int(frame_id) for frame_id in found.get("frames") or sorted(present)),
+            frame_ids=tuple(int(frame_id) for frame_id in found.get("frames") or sorted(files.scans)),
             garment_colour=_optional_colour(found.get("garment_colour")),
             boundary_colours={name: parse_colour(text) for name, text in found.get("boundary_colours", {}).items()},
             units=_parse_units(found.get("units", "m")),
+            files=files,
         )
     except InputError as error:
-        raise InputError(f"{description}: {str(error).removeprefix(f'{path}: ')}") from None
+        raise error.at(description) from None
     except KeyError as error:
-        raise InputError(f"{description}: expected the entry {error}, found none") from None
+        raise InputError(f"expected the entry {error}, found none", where=description) from None
     except (AttributeError, TypeError, ValueError) as error:
-        raise InputError(f"{description}: {error}") from None
-    missing = [frame_id for frame_id in capture.frame_ids if frame_id not in present]
+        raise InputError(str(error), where=description) from None
+    missing = [frame_id for frame_id in capture.frame_ids if frame_id not in files.scans]
     if scans and missing:
         raise InputError(
-            f"{path / 'scans' / f'{missing[0]:06d}.ply'}: no such scan; {len(missing)} of "
-            f"{len(capture.frame_ids)} frames in capture.json have none"
+            f"no such scan; {len(missing)} of {len(capture.frame_ids)} frames in capture.json have none",
+            where=_expected_scan(path, missing[0]),
         )
     return capture
+
+
+def _list_files(path: Path) -> CaptureFiles:
+    folder = path / "scans"
+    entries = sorted(folder.iterdir()) if folder.is_dir() else []
+    scans: dict[int, Path] = {}
+    for suffix in SCAN_SUFFIXES[::-1]:  # of several files of a frame the first kind counts, and there the first name
+        found = (entry for entry in entries[::-1] if entry.suffix == suffix and entry.stem.isdecimal())
+        scans |= {int(entry.stem): entry for entry in found}
+    textures = tuple(entry for entry in entries if entry.suffix.lower() in TEXTURE_SUFFIXES)
+    return CaptureFiles((path / "capture.json").read_bytes(), scans, textures)
+
+
+def _expected_scan(path: Path, frame_id: int) -> Path:
+    return path / "scans" / f"{frame_id:06d}.ply"
 
 
 def write_capture_description(capture: Capture) -> None:
@@ -181,11 +290,14 @@ def scan_path(capture: Capture, frame_id: int) -> Path:
     Raises:
         InputError: there is none.
     """
-    for suffix in (".ply", ".glb", ".obj"):
-        path = capture.path / "scans" / f"{frame_id:06d}{suffix}"
-        if path.is_file():
-            return path
-    raise InputError(f"{capture.path / 'scans' / f'{frame_id:06d}.ply'}: no such scan")
+    if capture.files is not None:
+        found = capture.files.scans.get(frame_id)
+    else:
+        named = (capture.path / "scans" / f"{frame_id:06d}{suffix}" for suffix in SCAN_SUFFIXES)
+        found = next((path for path in named if path.is_file()), None)
+    if found is None:
+        raise InputError("no such scan", where=_expected_scan(capture.path, frame_id))
+    return found
 
 
 def read_scan(capture: Capture, frame_id: int) -> Scan:
@@ -197,7 +309,7 @@ def read_scan(capture: Capture, frame_id: int) -> Scan:
     path = scan_path(capture, frame_id)
     found = read_coloured_mesh(path)
     if found.colours is None:
-        raise InputError(f"{path}: expected a colour per vertex, found none, nor a texture")
+        raise InputError("expected a colour per vertex, found none, nor a texture", where=path)
     mesh = found.mesh
     if capture.units != "m":
         mesh = mesh.with_vertices(mesh.vertices * np.float32(METRES[capture.units]))
@@ -214,13 +326,13 @@ def capture_digest(capture: Capture, *, instead: Mapping[int, str] | None = None
     Args:
         instead: digests of scans to count instead of those that are there now, by frame.
     """
-    total = hashlib.sha256((capture.path / "capture.json").read_bytes())
+    files = capture.files or _list_files(capture.path)
+    total = hashlib.sha256(files.description)
     for frame_id in capture.frame_ids:
         digest = (instead or {}).get(frame_id) or scan_digest(scan_path(capture, frame_id))
         total.update(f"{frame_id} {digest}\n".encode())
-    for path in sorted((capture.path / "scans").iterdir()):
-        if path.suffix.lower() in TEXTURE_SUFFIXES:
-            total.update(f"{path.name} {scan_digest(path)}\n".encode())
+    for path in files.textures:
+        total.update(f"{path.name} {scan_digest(path)}\n".encode())
     return total.hexdigest()
 
 
@@ -234,45 +346,10 @@ def scan_digest(path: Path) -> str:
     return total.hexdigest()
 
 
-def template_digest(capture: Capture) -> str:
-    """Digest of the template.
-
-    Raises:
-        InputError: there is none.
-    """
-    return file_digest([template_path(capture)], root=capture.path)
-
-
-def body_digest(capture: Capture) -> str | None:
-    """Digest of the body; None where the capture brings none."""
-    path = capture.path / "body.npz"
-    return file_digest([path], root=capture.path) if path.is_file() else None
-
-
-def motion_digest(capture: Capture) -> str | None:
-    """Digest of the poses and of the body they move; None where the capture brings no poses."""
-    if not (capture.path / "poses.npz").is_file():
-        return None
-    paths = [capture.path / name for name in ("poses.npz", "body.npz")]
-    return file_digest([path for path in paths if path.is_file()], root=capture.path)
-
-
-def _scan_numbers(path: Path) -> set[int]:
-    folder = path / "scans"
-    if not folder.is_dir():
-        return set()
-    return {int(file.stem) for file in folder.iterdir() if file.suffix in MESH_SUFFIXES and file.stem.isdecimal()}
-
-
 # --- what else a capture may hold --------------------------------------------------------------------------------
 
 
-def read_poses(capture: Capture) -> PoseSequence | None:
-    """The poses of the take, one per scan and in their order; None if the capture has none.
-
-    Raises:
-        InputError: a scan has no pose.
-    """
+def _poses(capture: Capture) -> PoseSequence | None:
     path = capture.path / "poses.npz"
     if not path.is_file():
         return None
@@ -281,8 +358,9 @@ def read_poses(capture: Capture) -> PoseSequence | None:
     missing = [frame_id for frame_id in capture.frame_ids if frame_id not in index]
     if missing:
         raise InputError(
-            f"{path}: expected a pose for each of {len(capture.frame_ids)} scans, "
-            f"found none for {len(missing)} of them, frame {missing[0]} first"
+            f"expected a pose for each of {len(capture.frame_ids)} scans, "
+            f"found none for {len(missing)} of them, frame {missing[0]} first",
+            where=path,
         )
     rows = [index[frame_id] for frame_id in capture.frame_ids]
     return replace(
@@ -291,16 +369,6 @@ def read_poses(capture: Capture) -> PoseSequence | None:
         translations=poses.translations[rows],
         frame_ids=np.array(capture.frame_ids, np.int32),
     )
-
-
-def read_body(capture: Capture) -> Body | None:
-    path = capture.path / "body.npz"
-    return load_body(path) if path.is_file() else None
-
-
-def read_rig(capture: Capture) -> Rig | None:
-    path = capture.path / "rig.json"
-    return load_rig(path) if path.is_file() else None
 
 
 def template_path(capture: Capture) -> Path:
@@ -314,23 +382,5 @@ def template_path(capture: Capture) -> Path:
         if path.is_file():
             return path
     raise InputError(
-        f"{capture.path / 'template.npz'}: no such file, nor a template.obj; registration needs a template"
+        "no such file, nor a template.obj; registration needs a template", where=capture.path / "template.npz"
     )
-
-
-def read_template(capture: Capture) -> Garment:
-    """The garment to register: `template.npz`, or a bare mesh `template.obj` with loops called border_0, border_1, ...
-
-    Raises:
-        InputError: there is neither.
-    """
-    path = template_path(capture)
-    if path.suffix == ".npz":
-        return load_garment(path)
-    mesh = read_mesh(path).mesh
-    if capture.units != "m":
-        mesh = mesh.with_vertices(mesh.vertices * np.float32(METRES[capture.units]))
-    return Garment(mesh, {f"border_{index}": loop for index, loop in enumerate(boundary_loops(mesh.faces))})
-
-
-# --- truth -------------------------------------------------------------------------------------------------------

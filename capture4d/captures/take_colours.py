@@ -8,18 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 
-from capture4d.captures.capture import Capture, read_capture, read_scan, read_template
+from capture4d.captures.capture import Capture, read_scan
 from capture4d.colours.learning import Light, learn_colours
 from capture4d.colours.spaces import Colour
 from capture4d.errors import InputError
 from capture4d.types import Scan
 
-__all__ = ["KnownColours", "forget_learned_colours", "take_colours", "template_loops"]
+__all__ = ["KnownColours", "take_colours", "template_loops"]
 
 FRAMES = 4
 """Scans that colours are learned from."""
@@ -44,7 +42,7 @@ class KnownColours:
 
 
 def take_colours(capture: Capture, *, learn: bool = False) -> KnownColours:
-    """The colours of a take.
+    """The colours of a take; learning them reads a few scans and takes seconds.
 
     Args:
         learn: also where capture.json gives them all.
@@ -54,22 +52,14 @@ def take_colours(capture: Capture, *, learn: bool = False) -> KnownColours:
     """
     if capture.garment_colour is not None and not learn:
         return KnownColours(capture.garment_colour, capture.boundary_colours, tuple(capture.boundary_colours))
-    return _learned(capture.path.resolve(), capture.garment_colour, tuple(capture.boundary_colours.items()))
-
-
-def forget_learned_colours() -> None:
-    """Learn anew when next asked: the files of a take may have changed since. A stage does this once, as it begins."""
-    _learned.cache_clear()
-
-
-@lru_cache(maxsize=1)
-def _learned(path: Path, garment: Colour | None, boundary: tuple[tuple[str, Colour], ...]) -> KnownColours:
-    capture = read_capture(path)
-    paints = tuple(dict.fromkeys(colour for _, colour in boundary))
-    found = learn_colours(_some_scans(capture), garment=garment, paints=paints or None, source=str(path))
+    boundary = capture.boundary_colours
+    paints = tuple(dict.fromkeys(boundary.values()))
+    found = learn_colours(
+        _some_scans(capture), garment=capture.garment_colour, paints=paints or None, source=str(capture.path)
+    )
     if boundary:
         as_seen = dict(zip(paints, found.paints, strict=True))
-        named = {name: as_seen[colour] for name, colour in boundary}
+        named = {name: as_seen[colour] for name, colour in boundary.items()}
         return KnownColours(found.garment, named, tuple(named), found.others, found.light)
     names = template_loops(capture)
     if len(found.paints) == 1:
@@ -107,6 +97,6 @@ def _some_scans(capture: Capture) -> list[Scan]:
 def template_loops(capture: Capture) -> tuple[str, ...]:
     """Names of the template's borders, which name what is learned; none without a template."""
     try:
-        return tuple(read_template(capture).loops)
+        return tuple(capture.template.loops)
     except InputError:
         return ()

@@ -6,27 +6,18 @@ them: registration itself, or an animated model.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from capture4d.body.anny import load_anny
-from capture4d.captures.capture import (
-    Capture,
-    capture_digest,
-    read_body,
-    read_capture,
-    read_poses,
-)
+from capture4d.captures.capture import Capture, read_capture
 from capture4d.errors import InputError, StaleError
 from capture4d.files.arrays import ArrayFile
-from capture4d.files.atomic import (
-    read_json,
-    read_json_lines,
-    write_npy_rows,
-)
+from capture4d.files.atomic import read_json, read_json_lines, write_npy_rows
 from capture4d.files.records import load_body, load_garment, load_poses
 from capture4d.runs.stage import Stage, require_complete
 from capture4d.types import Body, PoseSequence, RegisteredSequence
@@ -35,43 +26,151 @@ __all__ = [
     "ANIMATE",
     "REGISTER",
     "VERDICTS",
-    "capture_path",
-    "captured_motion",
-    "failed_frames",
-    "find_moving_body",
-    "is_animated",
-    "load_moving_body",
+    "WorkFolder",
     "load_records",
     "load_registration",
     "load_tracking",
-    "registered_digest",
+    "open_work",
     "stack_vertices",
     "tracking_digest",
-    "work_capture",
 ]
 
+VERDICTS = ("good", "check", "failed")
+"""What a frame's file holds as a number."""
+REGISTER, ANIMATE = "register", "animate"
+"""Stages that write a registered sequence."""
 
-def tracking_digest(folder: Path, capture: Path) -> str:
+
+@dataclass(frozen=True, eq=False)
+class WorkFolder:
+    """WORK as it was when it was opened. What it holds is read when it is first asked for, and once."""
+
+    path: Path
+    stages: Mapping[str, Mapping[str, Any]]
+    """The stage.json of each of its folders that has one, by the folder's name."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What travels to another process: not what was read, which is read there if it is needed."""
+        return {"path": self.path, "stages": self.stages}
+
+    @property
+    def registered_digest(self) -> str:
+        """The digest of registration/, whichever stage made it.
+
+        Raises:
+            InputError: there is none, or it is unfinished.
+        """
+        record = self.stages.get("registration")
+        if record is None:
+            command = f"capture4d run CAPTURE --output {self.path}"
+            raise InputError(f"expected a work folder with a registration, found none; run: {command}", where=self.path)
+        if record.get("status") != "complete":
+            raise InputError(
+                f"'{record.get('stage')}' is not finished; run its command again", where=self.path / "registration"
+            )
+        return record["digest"]
+
+    @property
+    def is_animated(self) -> bool:
+        """Whether the sequence comes from a model, not from scans."""
+        return self.stages.get("registration", {}).get("stage") == ANIMATE
+
+    @cached_property
+    def registered(self) -> RegisteredSequence:
+        """The registered sequence; its vertices stay on disk until they are touched."""
+        return load_registration(self.path / "registration")
+
+    @cached_property
+    def records(self) -> list[dict[str, Any]]:
+        """The frames' measures and verdicts."""
+        return load_records(self.path / "registration")
+
+    @cached_property
+    def failed_frames(self) -> frozenset[int]:
+        """Frames whose registration failed; empty where nobody graded them."""
+        if not (self.path / "registration" / "metrics.jsonl").is_file():
+            return frozenset()
+        return frozenset(record["frame_id"] for record in self.records if record.get("verdict") == "failed")
+
+    @property
+    def capture_path(self) -> Path:
+        """Where the capture lies: as the first stage recorded it, or else inside the work folder.
+
+        Raises:
+            InputError: it is in neither place.
+        """
+        recorded = self.stages.get("garment", {}).get("sources", {}).get("capture")
+        for candidate in (recorded, self.path / "capture"):
+            if candidate is not None and (Path(candidate) / "capture.json").is_file():
+                return Path(candidate)
+        raise InputError(
+            f"expected the capture at {recorded or self.path / 'capture'}, found none there", where=self.path
+        )
+
+    @cached_property
+    def capture(self) -> Capture:
+        """The capture that the folder was made from.
+
+        Raises:
+            InputError: there are no scans' garments, or the capture is not where it was.
+        """
+        if "garment" not in self.stages:
+            command = f"capture4d extract CAPTURE --output {self.path}"
+            raise InputError(f"expected the scans' garments of 'extract', found none; run: {command}", where=self.path)
+        return read_capture(self.capture_path)
+
+    @cached_property
+    def posed_body(self) -> tuple[Body, PoseSequence] | None:
+        """The body and the poses with which the take was registered: those that were tracked, or those of the capture.
+
+        Raises:
+            StaleError: the body was tracked anew since.
+        """
+        if self.is_animated:
+            return load_tracking(self.path / "body")
+        upstream = self.stages.get("registration", {}).get("upstream", {})
+        if "body" not in upstream:
+            return read_capture(self.capture_path).posed_body
+        command = f"capture4d track CAPTURE --output {self.path}"
+        if require_complete(self.path / "body", "track", command) != upstream["body"]:
+            command = f"capture4d register CAPTURE --output {self.path} --tracked --overwrite"
+            raise StaleError(
+                f"expected the body with which it was registered, found another; run: {command}", where=self.path
+            )
+        return load_tracking(self.path / "body")
+
+    def require_posed_body(self) -> tuple[Body, PoseSequence]:
+        """The same; raises InputError where nothing moved the template."""
+        if self.posed_body is None:
+            raise InputError(
+                f"expected poses in {self.capture_path}, found none; track the body and register again", where=self.path
+            )
+        return self.posed_body
+
+
+def open_work(path: str | Path) -> WorkFolder:
+    """Open a work folder, finished or not; what is missing is told when it is asked for."""
+    path = Path(path)
+    records = {file.parent.name: read_json(file) for file in sorted(path.glob("*/stage.json"))}
+    return WorkFolder(path, records)
+
+
+# --- what stages leave -------------------------------------------------------------------------------------------
+
+
+def tracking_digest(folder: Path, capture: Capture) -> str:
     """Digest of a finished tracking.
 
     Raises:
         InputError: it is missing, unfinished, or that of other scans.
     """
-    command = f"capture4d track {capture} --output {folder.parent}"
-    return require_complete(folder, "track", command, made_from={"capture": capture_digest(read_capture(capture))})
+    command = f"capture4d track {capture.path} --output {folder.parent}"
+    return require_complete(folder, "track", command, made_from={"capture": capture.digest})
 
 
 def load_tracking(folder: Path) -> tuple[Body, PoseSequence]:
     """The tracked body and its poses."""
     return load_body(folder / "body.npz"), load_poses(folder / "poses.npz")
-
-
-VERDICTS = ("good", "check", "failed")
-"""What a frame's file holds as a number."""
-
-
-REGISTER, ANIMATE = "register", "animate"
-"""Stages that write a registered sequence."""
 
 
 def load_registration(folder: Path) -> RegisteredSequence:
@@ -86,11 +185,11 @@ def load_registration(folder: Path) -> RegisteredSequence:
     try:
         vertices = np.load(path, mmap_mode="r", allow_pickle=False)
     except FileNotFoundError:
-        raise InputError(f"{path}: no such file; run the command of '{folder.name}' again") from None
+        raise InputError(f"no such file; run the command of '{folder.name}' again", where=path) from None
     except (ValueError, EOFError) as error:
-        raise InputError(f"{path}: expected the vertices of all frames, found a damaged file ({error})") from None
+        raise InputError(f"expected the vertices of all frames, found a damaged file ({error})", where=path) from None
     if len(vertices) != len(frame_ids):
-        raise InputError(f"{path}: expected vertices of {len(frame_ids)} frames, found {len(vertices)}")
+        raise InputError(f"expected vertices of {len(frame_ids)} frames, found {len(vertices)}", where=path)
     return RegisteredSequence(garment, vertices, np.array(residual, np.float32), np.array(frame_ids, np.int32))
 
 
@@ -110,94 +209,26 @@ def load_records(folder: Path) -> list[dict[str, Any]]:
     return read_json_lines(folder / "metrics.jsonl")
 
 
+# TRANSITION
 def failed_frames(work: Path) -> set[int]:
-    """Frames whose registration failed; empty where nobody graded them."""
-    folder = work / "registration"
-    if not (folder / "metrics.jsonl").is_file():
-        return set()
-    return {record["frame_id"] for record in load_records(folder) if record.get("verdict") == "failed"}
+    return set(open_work(work).failed_frames)
 
 
 def registered_digest(work: Path) -> str:
-    """The digest of WORK/registration, whichever stage made it.
-
-    Raises:
-        InputError: there is none, or it is unfinished.
-    """
-    record_path = work / "registration" / "stage.json"
-    if not record_path.is_file():
-        raise InputError(f"{work}: expected a work folder with a registration, found none; run: capture4d run CAPTURE "
-                         f"--output {work}")  # fmt: skip
-    record = read_json(record_path)
-    if record.get("status") != "complete":
-        raise InputError(f"{work / 'registration'}: '{record.get('stage')}' is not finished; run its command again")
-    return record["digest"]
+    return open_work(work).registered_digest
 
 
 def is_animated(work: Path) -> bool:
-    """Whether the sequence comes from a model, not from scans."""
-    record = work / "registration" / "stage.json"
-    return record.is_file() and read_json(record).get("stage") == ANIMATE
-
-
-def capture_path(work: Path) -> Path:
-    """Where the capture lies: as the first stage recorded it, or else inside the work folder.
-
-    Raises:
-        InputError: it is in neither place.
-    """
-    record = work / "garment" / "stage.json"
-    recorded = read_json(record).get("sources", {}).get("capture") if record.is_file() else None
-    for candidate in (recorded, work / "capture"):
-        if candidate is not None and (Path(candidate) / "capture.json").is_file():
-            return Path(candidate)
-    raise InputError(f"{work}: expected the capture at {recorded or work / 'capture'}, found none there")
+    return open_work(work).is_animated
 
 
 def work_capture(work: Path) -> Capture:
-    """The capture a work folder was made from.
-
-    Raises:
-        InputError: there are no scans' garments, or the capture is not where it was.
-    """
-    if not (work / "garment" / "stage.json").is_file():
-        raise InputError(f"{work}: expected the scans' garments of 'extract', found none; run: capture4d extract "
-                         f"CAPTURE --output {work}")  # fmt: skip
-    return read_capture(capture_path(work))
-
-
-def captured_motion(capture: Capture) -> tuple[Body | None, PoseSequence | None]:
-    """The body and the poses that a capture brings; the built-in body where poses come without one.
-
-    Raises:
-        InputError: a scan has no pose.
-    """
-    body, poses = read_body(capture), read_poses(capture)
-    return (load_anny() if body is None and poses is not None else body), poses
+    return open_work(work).capture
 
 
 def load_moving_body(work: Path) -> tuple[Body, PoseSequence]:
-    """The body and the poses with which a take was registered.
-
-    Raises:
-        InputError: there are none.
-    """
-    moving = find_moving_body(work)
-    if moving is None:
-        capture = capture_path(work)
-        raise InputError(f"{work}: expected poses in {capture}, found none; track the body and register again")
-    return moving
+    return open_work(work).require_posed_body()
 
 
 def find_moving_body(work: Path) -> tuple[Body, PoseSequence] | None:
-    """The same, or None: those that were tracked, or those of the capture."""
-    if is_animated(work):
-        return load_tracking(work / "body")
-    upstream = read_json(work / "registration" / "stage.json").get("upstream", {})
-    if "body" in upstream:
-        if require_complete(work / "body", "track", f"capture4d track CAPTURE --output {work}") != upstream["body"]:
-            raise StaleError(f"{work}: expected the body with which it was registered, found another; run: capture4d "
-                             f"register CAPTURE --output {work} --tracked --overwrite")  # fmt: skip
-        return load_tracking(work / "body")
-    body, poses = captured_motion(read_capture(capture_path(work)))
-    return None if body is None or poses is None else (body, poses)
+    return open_work(work).posed_body

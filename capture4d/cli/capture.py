@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, UseAppendAction, arg
 
 from capture4d.calibration.config import CalibrationConfig, RigCheckConfig
+from capture4d.cli.exit_codes import BAD_RESULT, GOOD
 from capture4d.cli.options import all_cores
 
 __all__ = ["Calibrate", "Check", "CheckRig"]
@@ -17,7 +18,7 @@ __all__ = ["Calibrate", "Check", "CheckRig"]
 
 @dataclass(frozen=True, kw_only=True)
 class Check:
-    """Look through a take before a night is spent on it; exit code 0: clean, 1: warnings, 2: errors."""
+    """Look through a take before a night is spent on it; exit code 3 if it has errors."""
 
     capture: Annotated[Positional[Path], arg(metavar="CAPTURE")]
     """Capture folder, or just a folder of scans."""
@@ -41,6 +42,8 @@ class Check:
     """Look at every frame instead of a sample."""
     fix: bool = False
     """Write a corrected take to CAPTURE-fixed; looks at every frame."""
+    strict: bool = False
+    """Exit code 3 for warnings, too."""
     json: bool = False
     """Print JSON instead of a table."""
     workers: int = field(default_factory=all_cores)
@@ -49,7 +52,7 @@ class Check:
     def __call__(self) -> int:
         import json
 
-        from capture4d.app.report.check import as_json, exit_code, print_table
+        from capture4d.app.report.check import as_json, print_table, status
         from capture4d.preflight.fix import write_fixed
         from capture4d.preflight.stage import check_take
         from capture4d.preflight.take_folder import Claims
@@ -72,7 +75,8 @@ class Check:
             print_table(checked)
             if fixed is not None:
                 print(f"corrected: {fixed}")
-        return exit_code(checked.verdict)
+        bad = ("warnings", "errors") if self.strict else ("errors",)
+        return BAD_RESULT if status(checked.verdict) in bad else GOOD
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,12 +113,12 @@ class Calibrate:
         print_calibration(report)
         page = write_page(self.output.with_name("calibration.html"), report)
         print(f"rig: {self.output}, report: {page}")
-        return 0
+        return GOOD
 
 
 @dataclass(frozen=True, kw_only=True)
 class CheckRig:
-    """Tell which cameras have moved since calibration, from one pose of the board; exits with 1 if one has."""
+    """Tell which cameras have moved since calibration, from one pose of the board; exit code 3 if one has."""
 
     rig: Annotated[Positional[Path], arg(metavar="RIG")]
     """rig.json; the calibration.json beside it knows the board and how certain the rig is."""
@@ -139,4 +143,4 @@ class CheckRig:
         moved = [check.name for check in checks if check.verdict == "moved"]
         if moved:
             print(f"capture4d: moved since calibration: {', '.join(moved)}", file=sys.stderr)
-        return 1 if moved else 0
+        return BAD_RESULT if moved else GOOD

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from capture4d.cli.exit_codes import BAD_RESULT, GOOD
 from registration.config import MeshRegistrationConfig
 
 __all__ = ["ConvertBody", "ConvertPoses", "ConvertRig", "RegisterMesh", "Template"]
@@ -59,7 +61,7 @@ class Template:
         print(f"borders: {loops}")
         print(f"UVs: {uvs}")
         print(f"template: {self.output}")
-        return 0
+        return GOOD
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,9 +80,12 @@ class RegisterMesh:
         from capture4d.extraction.garment import painted_border
         from registration.register_mesh import run
 
-        run(self.template, self.scan, self.output, self.config, find_border=painted_border)
+        result = run(self.template, self.scan, self.output, self.config, find_border=painted_border)
         print(f"registered: {self.output}, measures: {self.output.with_suffix('.json')}")
-        return 0
+        quality = result.quality
+        if quality.verdict != "good":
+            print(f"capture4d: {self.output}: {quality.verdict}: {'; '.join(quality.reasons)}", file=sys.stderr)
+        return BAD_RESULT if quality.verdict == "failed" else GOOD
 
 
 @dataclass(frozen=True)
@@ -97,7 +102,7 @@ class ConvertBody:
 
         convert_smpl(self.file, self.output)
         print(f"body: {self.output}")
-        return 0
+        return GOOD
 
 
 @dataclass(frozen=True)
@@ -116,7 +121,7 @@ class ConvertRig:
 
         convert(self.source, self.output, text=self.text)
         print(f"rig: {self.output}")
-        return 0
+        return GOOD
 
 
 @dataclass(frozen=True)
@@ -143,4 +148,4 @@ class ConvertPoses:
         poses = read_motion(self.input, body, fps=self.fps)
         write_motion(self.output, body, poses, amass=self.format == "amass")
         print(f"{len(poses.frame_ids)} poses at {poses.fps:g} fps: {self.output}")
-        return 0
+        return GOOD

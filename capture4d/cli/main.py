@@ -1,33 +1,38 @@
 """The `capture4d` command: one subcommand per stage, and `run` for all of them.
 
-Bad input ends in one line on stderr and exit code 1, a broken limit in exit code 1, a wrong command line in 2, Ctrl-C
-in 130; `check` grades a take by 0, 1 and 2; anything else is a bug and keeps its traceback.
+Whatever goes wrong with the input ends in one line on stderr; `capture4d.cli.exit_codes` says what the codes mean.
+Anything else is a bug and keeps its traceback.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import difflib
 import errno
 import os
+import signal
 import sys
-from collections.abc import Mapping, Sequence
+import threading
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NoReturn
 
 import tyro
 
 from capture4d.cli.capture import Calibrate, Check, CheckRig
+from capture4d.cli.demo import Demo
+from capture4d.cli.exit_codes import BAD_COMMAND_LINE, BAD_INPUT, GOOD, INTERRUPTED, TERMINATED
 from capture4d.cli.files import ConvertBody, ConvertPoses, ConvertRig, RegisterMesh, Template
 from capture4d.cli.models import Animate, Fit
 from capture4d.cli.stages import Extract, Register, Report, Run, Track
-from capture4d.cli.synthesis import Demo, Scan, Synth, SynthBoard
+from capture4d.cli.synthesis import Scan, Synth, SynthBoard
 from capture4d.cli.wrinkles import Compare, WrinklesApply, WrinklesMaps, WrinklesTrain
 from capture4d.errors import InputError
 from data_synth import config as synth_config
 from registration import config as registration_config
 from wrinkles.normal_maps import config as wrinkle_config
 
-__all__ = ["main"]
+__all__ = ["COMMANDS", "main"]
 
 # What a user's disk can answer; the message names the path, and a traceback would add nothing.
 _DISK_ANSWERS = {
@@ -42,7 +47,7 @@ _DISK_ANSWERS = {
     errno.EROFS,
 }
 
-_COMMANDS: Mapping[str, Any] = {
+COMMANDS: Mapping[str, Any] = {
     "demo": Demo,
     "synth": Synth,
     "scan": Scan,
@@ -82,7 +87,27 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     # is what the work costs. Numerical libraries read these as they load, which is later.
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
-    sys.exit(_run(list(sys.argv[1:] if arguments is None else arguments)))
+    with _answering_to_termination():
+        sys.exit(_run(list(sys.argv[1:] if arguments is None else arguments)))
+
+
+class _TerminatedError(BaseException):
+    """SIGTERM, which a scheduler sends to a job whose time is up."""
+
+
+@contextlib.contextmanager
+def _answering_to_termination() -> Iterator[None]:
+    def terminate(number: int, frame: object) -> None:
+        raise _TerminatedError
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _run(arguments: list[str]) -> int:
@@ -94,7 +119,7 @@ def _run(arguments: list[str]) -> int:
         return _complain(str(error))
     except BrokenPipeError:  # whoever read our output, such as `head`, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+        return GOOD
     except OSError as error:
         if error.errno not in _DISK_ANSWERS or (error.filename is None and error.errno != errno.ENOSPC):
             raise
@@ -107,37 +132,41 @@ def _run(arguments: list[str]) -> int:
             raise
         return _complain(str(error))
     except KeyboardInterrupt:
-        return _complain("interrupted; finished frames are kept, the same command goes on", code=130)
+        return _complain("interrupted; finished frames are kept, the same command goes on", code=INTERRUPTED)
+    except _TerminatedError:
+        return _complain("terminated; finished frames are kept, the same command goes on", code=TERMINATED)
 
 
 def _dispatch(arguments: list[str]) -> int:
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_overview())
-        return 0 if arguments else 2
+        return GOOD if arguments else BAD_COMMAND_LINE
     if arguments[0] == "--version":
         from importlib.metadata import version
 
         print(f"capture4d {version('capture4d')}")
-        return 0
+        return GOOD
     name, *rest = arguments
-    if any(command.startswith(f"{name} ") for command in _COMMANDS):  # a group, such as `wrinkles train`
+    if any(command.startswith(f"{name} ") for command in COMMANDS):  # a group, such as `wrinkles train`
         if not rest or rest[0] in ("-h", "--help"):
             print(_overview(f"{name} "))
-            return 0 if rest else 2
+            return GOOD if rest else BAD_COMMAND_LINE
         name, rest = f"{name} {rest[0]}", rest[1:]
-    if name not in _COMMANDS:
-        near = difflib.get_close_matches(name, _COMMANDS, n=1)
+    if name not in COMMANDS:
+        near = difflib.get_close_matches(name, COMMANDS, n=1)
         hint = f"; did you mean '{near[0]}'?" if near else ""
-        return _complain(f"unknown command '{name}'{hint} (see capture4d --help)", code=2)
+        return _complain(f"unknown command '{name}'{hint} (see capture4d --help)", code=BAD_COMMAND_LINE)
     command = _parse(name, rest)
     if getattr(command, "workers", 1) < 1:
         raise InputError(f"--workers: expected at least 1, found {command.workers}")
+    if not 0 <= getattr(command, "max_failed", 0) <= 100:
+        raise InputError(f"--max-failed: expected a percentage between 0 and 100, found {command.max_failed:g}")
     return command()
 
 
 def _parse(name: str, arguments: list[str]) -> Any:
     """The command with its options. A --preset decides what the other settings start from."""
-    command = _COMMANDS[name]
+    command = COMMANDS[name]
     presets = _PRESETS.get(command)
     default = None
     if presets:
@@ -164,7 +193,7 @@ def _value_of(option: str, arguments: list[str]) -> str | None:
 def _overview(group: str = "") -> str:
     lines = [
         f"  {name:<15} {(command.__doc__ or '').splitlines()[0]}"
-        for name, command in _COMMANDS.items()
+        for name, command in COMMANDS.items()
         if name.startswith(group)
     ]
     return "\n".join(
@@ -180,6 +209,6 @@ def _overview(group: str = "") -> str:
     )
 
 
-def _complain(message: str, *, code: int = 1) -> int:
+def _complain(message: str, *, code: int = BAD_INPUT) -> int:
     print(f"capture4d: {' '.join(message.splitlines())}", file=sys.stderr)
     return code

@@ -8,7 +8,8 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from capture4d.cli.options import StageOptions
+from capture4d.cli.exit_codes import GOOD
+from capture4d.cli.options import GradedOptions, StageOptions
 from capture4d.errors import InputError
 from retarget.config import AnimateConfig, FitConfig
 
@@ -39,11 +40,11 @@ class Fit(StageOptions):
         works = [first, *others]
         run(works, folder, self.config, device=self.device, workers=self.workers, overwrite=self.overwrite)
         print(f"model: {folder}")
-        return 0
+        return GOOD
 
 
 @dataclass(frozen=True, kw_only=True)
-class Animate(StageOptions):
+class Animate(GradedOptions):
     """Put a learned garment on a motion, and on another body: a sequence like a registered one."""
 
     model: Annotated[Positional[Path], arg(metavar="MODEL")]
@@ -63,7 +64,7 @@ class Animate(StageOptions):
     def __call__(self) -> int:
         from retarget.animation.stage import run
 
-        run(
+        result = run(
             self.model,
             self.poses,
             self.output,
@@ -75,4 +76,4 @@ class Animate(StageOptions):
             overwrite=self.overwrite,
         )
         print(f"registration: {self.output / 'registration'}")
-        return 0
+        return self.graded(result)

@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 import os
+import sys
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
-__all__ = ["StageOptions", "all_cores"]
+from capture4d.cli.exit_codes import BAD_RESULT, GOOD
+
+if TYPE_CHECKING:
+    from capture4d.runs.stage import StageResult
+
+__all__ = ["GradedOptions", "StageOptions", "all_cores"]
 
 
 def all_cores() -> int:
@@ -18,3 +25,22 @@ class StageOptions:
     """Processes to use; the result does not depend on it."""
     overwrite: bool = False
     """Start clean: delete what an earlier run left in the output folder."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GradedOptions(StageOptions):
+    """Of stages whose frames can fail."""
+
+    max_failed: float = 5.0
+    """Percent of frames that may fail; more of them end in exit code 3."""
+
+    def graded(self, result: StageResult) -> int:
+        """The exit code of a finished stage; says on stderr what is wrong with it."""
+        if not result.failed:
+            return GOOD
+        frame_id, reason = next(iter(result.failed.items()))
+        count = f"{len(result.failed)} of {result.frames} frames failed ({result.failed_percent:.3g} %"
+        broken = result.failed_percent > self.max_failed
+        limit = f", more than the {self.max_failed:g} % allowed" if broken else ""
+        print(f"capture4d: {count}{limit}); frame {frame_id}: {reason}", file=sys.stderr)
+        return BAD_RESULT if broken else GOOD

@@ -9,7 +9,8 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from capture4d.cli.options import StageOptions
+from capture4d.cli.exit_codes import BAD_RESULT, GOOD
+from capture4d.cli.options import GradedOptions, StageOptions
 from capture4d.tracking.config import TrackingConfig
 from registration.config import RegistrationConfig
 
@@ -29,16 +30,21 @@ class Extract(StageOptions):
     garment_colour in capture.json they are learned anyway."""
 
     def __call__(self) -> int:
-        from capture4d.extraction.stage import flagged_frames, run
+        from capture4d import pipeline
 
-        folder = self.output / "garment"
-        run(self.capture, folder, learn_colours=self.learn_colours, workers=self.workers, overwrite=self.overwrite)
-        flagged = flagged_frames(folder)
-        if flagged:
-            frame_id, reason = next(iter(flagged.items()))
-            print(f"capture4d: no garment in {len(flagged)} frames, first in {frame_id}: {reason}", file=sys.stderr)
-        print(f"garment: {folder}")
-        return 0
+        result = pipeline.extract(
+            self.capture,
+            self.output,
+            learn_colours=self.learn_colours,
+            workers=self.workers,
+            overwrite=self.overwrite,
+        )
+        if result.failed:
+            frame_id, reason = next(iter(result.failed.items()))
+            print(f"capture4d: no garment in {len(result.failed)} frames, first in {frame_id}: {reason}",
+                  file=sys.stderr)  # fmt: skip
+        print(f"garment: {result.path}")
+        return GOOD
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,15 +58,18 @@ class Track(StageOptions):
     config: Annotated[TrackingConfig, arg(name="")] = field(default_factory=TrackingConfig)
 
     def __call__(self) -> int:
-        from capture4d.tracking.stage import run
+        from capture4d import pipeline
 
-        run(self.capture, self.output / "body", self.config, workers=self.workers, overwrite=self.overwrite)
-        print(f"body: {self.output / 'body'}")
-        return 0
+        result = pipeline.track(self.capture, self.output, self.config, workers=self.workers, overwrite=self.overwrite)
+        if result.failed:
+            frame_id, reason = next(iter(result.failed.items()))
+            print(f"capture4d: lost in {len(result.failed)} frames, first in {frame_id}: {reason}", file=sys.stderr)
+        print(f"body: {result.path}")
+        return GOOD
 
 
 @dataclass(frozen=True, kw_only=True)
-class Register(StageOptions):
+class Register(GradedOptions):
     """Register the template to every frame whose garment `extract` has cut out."""
 
     capture: Annotated[Positional[Path], arg(metavar="CAPTURE")]
@@ -74,23 +83,22 @@ class Register(StageOptions):
     config: Annotated[RegistrationConfig, arg(name="")] = field(default_factory=RegistrationConfig)
 
     def __call__(self) -> int:
-        from registration.stage import run
+        from capture4d import pipeline
 
-        run(
+        result = pipeline.register(
             self.capture,
-            self.output / "garment",
-            self.output / "registration",
+            self.output,
             self.config,
-            body_folder=self.output / "body" if self.tracked else None,
+            tracked=self.tracked,
             workers=self.workers,
             overwrite=self.overwrite,
         )
-        print(f"registration: {self.output / 'registration'}")
-        return 0
+        print(f"registration: {result.path}")
+        return self.graded(result)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Run(StageOptions):
+class Run(GradedOptions):
     """Run every stage on a capture: extract, track if it brings no poses, register, report."""
 
     capture: Annotated[Positional[Path], arg(metavar="CAPTURE")]
@@ -105,19 +113,19 @@ class Run(StageOptions):
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
 
     def __call__(self) -> int:
-        from capture4d.pipeline import run_all
+        from capture4d import pipeline
 
-        report = run_all(
+        result = pipeline.run(
             self.capture,
             self.output,
             self.config,
             tracking=self.tracking,
-            track=self.track,
+            tracked=self.track,
             workers=self.workers,
             overwrite=self.overwrite,
         )
-        print(f"report: {report}")
-        return 0
+        print(f"report: {result.path}")
+        return self.graded(result)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,17 +135,18 @@ class Report(StageOptions):
     work: Annotated[Positional[Path], arg(metavar="WORK")]
     """Work folder; holds registration/ and gets report/."""
     fail_above: UseAppendAction[tuple[Annotated[str, arg(metavar="METRIC=LIMIT")], ...]] = ()
-    """Exit with 1 if this metric of report/metrics.json is above the limit; may be given several times."""
+    """Exit with 3 if this metric of report/metrics.json is above the limit; may be given several times."""
     capture: Path | None = None
     """Capture folder, if it is not where it was when it was registered."""
 
     def __call__(self) -> int:
-        from capture4d.pipeline import broken_limits, parse_limits, run_report
+        from capture4d import pipeline
+        from capture4d.app.report.limits import broken_limits, parse_limits
 
         limits = parse_limits(self.fail_above)
-        page = run_report(self.work, capture=self.capture, workers=self.workers, overwrite=self.overwrite)
-        print(f"report: {page}")
+        result = pipeline.report(self.work, capture=self.capture, workers=self.workers, overwrite=self.overwrite)
+        print(f"report: {result.path}")
         broken = broken_limits(self.work, limits)
         for line in broken:
             print(f"capture4d: {line}", file=sys.stderr)
-        return 1 if broken else 0
+        return BAD_RESULT if broken else GOOD

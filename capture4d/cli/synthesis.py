@@ -1,4 +1,4 @@
-"""`capture4d demo`, `synth`, `scan` and `synth-board`: captures that nobody filmed."""
+"""`capture4d synth`, `scan` and `synth-board`: captures that nobody filmed."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
+from capture4d.cli.exit_codes import GOOD
 from capture4d.cli.options import StageOptions
 from capture4d.errors import InputError
 from data_synth import config as synth_config
 from data_synth.scanner.config import ScanConfig
 
-__all__ = ["Demo", "Scan", "Synth", "SynthBoard"]
+__all__ = ["Scan", "Synth", "SynthBoard"]
 
 
 def _with_sensor(config: Any, sensor: Literal["depth", "stereo"] | None) -> Any:
@@ -22,22 +23,6 @@ def _with_sensor(config: Any, sensor: Literal["depth", "stereo"] | None) -> Any:
     if sensor is None:
         return config
     return dataclasses.replace(config, scanner=dataclasses.replace(config.scanner, sensor=sensor))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Demo(StageOptions):
-    """Make a synthetic capture, calibrate, track, register, learn the garment, put it on another body: in minutes."""
-
-    output: Path = Path("out")
-    """Folder for everything, the capture included."""
-
-    def __call__(self) -> int:
-        from capture4d.pipeline import run_demo
-
-        report, other = run_demo(self.output, workers=self.workers, overwrite=self.overwrite)
-        print(f"report: {report}")
-        print(f"on another body: {other}")
-        return 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +44,7 @@ class Synth(StageOptions):
 
         run(self.output, _with_sensor(self.config, self.scanner), workers=self.workers, overwrite=self.overwrite)
         print(f"capture: {self.output}")
-        return 0
+        return GOOD
 
     def _training_set(self) -> int:
         from data_synth.training_set import run
@@ -68,7 +53,7 @@ class Synth(StageOptions):
             raise InputError(f"--preset {self.preset}: expected no other settings, for its takes bring their own")
         run(self.output, synth_config.TRAINING_SETS[self.preset], workers=self.workers, overwrite=self.overwrite)
         print(f"captures: {self.output / 'takes'}")
-        return 0
+        return GOOD
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,7 +83,7 @@ class Scan(StageOptions):
             overwrite=self.overwrite,
         )
         print(f"capture: {self.output}")
-        return 0
+        return GOOD
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,4 +101,4 @@ class SynthBoard(StageOptions):
 
         run(self.rig, self.images, self.config, workers=self.workers, overwrite=self.overwrite)
         print(f"board images: {self.images}")
-        return 0
+        return GOOD

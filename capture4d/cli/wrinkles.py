@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from capture4d.app.compare.config import CompareConfig
+from capture4d.cli.exit_codes import GOOD
 from capture4d.cli.options import StageOptions, all_cores
 from wrinkles.normal_maps import config as wrinkle_config
 from wrinkles.normal_maps.config import PairConfig, WrinkleConfig
@@ -35,7 +36,7 @@ class WrinklesMaps(StageOptions):
 
         run(self.work, self.config, high_from=self.high_from, workers=self.workers, overwrite=self.overwrite)
         print(f"maps: {self.work / 'wrinkles' / 'pairs'}")
-        return 0
+        return GOOD
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +59,7 @@ class WrinklesTrain(StageOptions):
 
         run(self.works, self.output, self.config, pairs=self.pairs, workers=self.workers, overwrite=self.overwrite)
         print(f"model: {self.output}")
-        return 0
+        return GOOD
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +81,7 @@ class WrinklesApply(StageOptions):
         settings = ApplyConfig(flip_green=self.flip_green, bits=self.bits)
         run(self.model, self.work, settings, workers=self.workers, overwrite=self.overwrite)
         print(f"maps: {self.work / 'wrinkles' / 'generated' / 'frames'}")
-        return 0
+        return GOOD
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,4 +109,4 @@ class Compare(StageOptions):
             overwrite=self.overwrite,
         )
         print(f"comparison: {page}")
-        return 0
+        return GOOD

@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from capture4d.captures.capture import Capture, capture_digest, read_capture, read_scan, scan_digest, scan_path
+from capture4d.captures.capture import Capture, capture_digest, read_scan, scan_digest, scan_path
 from capture4d.captures.garment_scans import save_garment_scan
-from capture4d.captures.take_colours import KnownColours, forget_learned_colours, take_colours, template_loops
+from capture4d.captures.take_colours import KnownColours, take_colours, template_loops
 from capture4d.colours.spaces import format_colour
 from capture4d.errors import InputError
 from capture4d.extraction.garment import ColourNotFoundError, cut_out
@@ -30,7 +30,7 @@ from capture4d.runs.stage import Stage, StageResult, open_stage
 from capture4d.runs.workers import run_jobs
 from capture4d.types import GarmentScan
 
-__all__ = ["flagged_frames", "run"]
+__all__ = ["ExtractionSettings", "flagged_frames", "run"]
 
 SCHEMA = 4
 
@@ -41,51 +41,53 @@ class ExtractionSettings:
 
     schema: int = SCHEMA
     learn_colours: bool = False
+    """Learn all colours from the scans, not only those that capture.json leaves open."""
 
 
 def run(
-    capture: Path, output: Path, *, learn_colours: bool = False, workers: int = 1, overwrite: bool = False
+    capture: Capture, output: Path, config: ExtractionSettings, *, workers: int = 1, overwrite: bool = False
 ) -> StageResult:
     """Extract the garment of every frame that has none yet.
 
-    Args:
-        learn_colours: learn all colours from the scans, not only those that capture.json leaves open.
     Raises:
         InputError: a scan is missing, none can be read, or the first that can lacks the garment's colours; or these are
             to be learned and are not separable.
     """
-    description = read_capture(capture)
     named = {}
-    if not description.boundary_colours and (learn_colours or description.garment_colour is None):
-        named["loops"] = " ".join(template_loops(description))
-    before = _unreadable_scans(output, description.frame_ids)
+    if not capture.boundary_colours and (config.learn_colours or capture.garment_colour is None):
+        named["loops"] = " ".join(template_loops(capture))
+    before = _unreadable_scans(output, capture.frame_ids)
     stage = open_stage(
         output,
         name="extract",
         schema=SCHEMA,
-        config=ExtractionSettings(learn_colours=learn_colours),
-        upstream={"capture": capture_digest(description), **named},
-        sources={"capture": capture},
-        formerly={"capture": capture_digest(description, instead=before), **named} if before else None,
+        config=config,
+        upstream={"capture": capture.digest, **named},
+        sources={"capture": capture.path},
+        formerly={"capture": capture_digest(capture, instead=before), **named} if before else None,
         overwrite=overwrite,
     )
-    forget_learned_colours()
     colours_path = stage.path / "colours.json"
-    pending = sorted({*stage.pending(description.frame_ids), *before})
+    pending = sorted({*stage.pending(capture.frame_ids), *before})
     if pending or not colours_path.is_file():
-        colours = take_colours(description, learn=learn_colours)
+        colours = take_colours(capture, learn=config.learn_colours)
         write_json(colours_path, _described(colours))
-        done = _extract_first(description, colours, stage, pending)
+        done = _extract_first(capture, colours, stage, pending)
         jobs = [(frame_id, stage.frame_path(frame_id)) for frame_id in pending if frame_id != done]
-        for _ in run_jobs(partial(write_frame, description, colours), jobs, workers=workers, label="extract garment"):
+        for _ in run_jobs(partial(write_frame, capture, colours), jobs, workers=workers, label="extract garment"):
             pass
-    frames = [stage.frame_path(frame_id) for frame_id in description.frame_ids]
-    return stage.finish([colours_path, *frames], changed=bool(pending))
+    frames = [stage.frame_path(frame_id) for frame_id in capture.frame_ids]
+    return stage.finish(
+        [colours_path, *frames],
+        changed=bool(pending),
+        frames=len(capture.frame_ids),
+        failed=flagged_frames(output, capture.frame_ids),
+    )
 
 
-def flagged_frames(folder: Path) -> dict[int, str]:
-    """Frames of an extraction without a garment, and why, in ascending order."""
-    reasons = {int(path.stem): _reason(path) for path in sorted((folder / "frames").glob("*.npz"))}
+def flagged_frames(folder: Path, frame_ids: Sequence[int]) -> dict[int, str]:
+    """Frames of an extraction without a garment, and why."""
+    reasons = {frame_id: _reason(folder / "frames" / f"{frame_id:06d}.npz") for frame_id in frame_ids}
     return {frame_id: reason for frame_id, reason in reasons.items() if reason}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -22,12 +23,13 @@ def mesh_arrays(prefix: str, mesh: Mesh) -> dict[str, np.ndarray]:
 class ArrayFile:
     """An open npz file in which everything that is wrong becomes an InputError that names the file."""
 
-    def __init__(self, path: str | Path) -> None:
-        self._path = Path(path)
+    def __init__(self, path: str | Path, data: bytes | None = None) -> None:
+        """`data`: what the file holds, if it was read already."""
+        self._path, self._data = Path(path), data
 
     def __enter__(self) -> ArrayFile:
         try:
-            self._stream = self._path.open("rb")
+            self._stream = self._path.open("rb") if self._data is None else io.BytesIO(self._data)
         except FileNotFoundError:
             raise InputError(f"{self._path}: no such file") from None
         try:

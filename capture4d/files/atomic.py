@@ -9,7 +9,7 @@ import io
 import json
 import os
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +19,12 @@ from capture4d.errors import InputError
 
 __all__ = [
     "TEMPORARY_SUFFIX",
+    "content_digest",
     "file_digest",
+    "parse_json",
     "plain_value",
     "read_json",
+    "read_json_lines",
     "write_bytes",
     "write_chunks",
     "write_json",
@@ -114,11 +117,17 @@ def read_json(path: str | Path) -> Any:
     """Read JSON; a missing or damaged file is an InputError that names it."""
     path = Path(path)
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return parse_json(path.read_bytes(), path)
     except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
+        raise InputError("no such file", where=path) from None
+
+
+def parse_json(data: bytes, path: Path) -> Any:
+    """The value in a file's bytes; damage is an InputError that names the file."""
+    try:
+        return json.loads(data.decode())
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid JSON ({error})") from None
+        raise InputError(f"not valid JSON ({error})", where=path) from None
 
 
 def read_json_lines(path: str | Path) -> list[dict[str, Any]]:
@@ -144,11 +153,20 @@ def read_json_lines(path: str | Path) -> list[dict[str, Any]]:
 
 def file_digest(paths: Iterable[Path], *, root: Path) -> str:
     """SHA-256 over the names (relative to `root`) and contents of files, whatever order they come in."""
-    total = hashlib.sha256()
-    for name, path in sorted((path.relative_to(root).as_posix(), path) for path in paths):
+    parts = {}
+    for path in paths:
         with path.open("rb") as file:
-            total.update(f"{name}\0{hashlib.file_digest(file, 'sha256').hexdigest()}\n".encode())
-    return total.hexdigest()
+            parts[path.relative_to(root).as_posix()] = hashlib.file_digest(file, "sha256").hexdigest()
+    return _joined_digest(parts)
+
+
+def content_digest(files: Mapping[str, bytes]) -> str:
+    """`file_digest` of files that were read already: contents by name."""
+    return _joined_digest({name: hashlib.sha256(data).hexdigest() for name, data in files.items()})
+
+
+def _joined_digest(parts: Mapping[str, str]) -> str:
+    return hashlib.sha256("".join(f"{name}\0{part}\n" for name, part in sorted(parts.items())).encode()).hexdigest()
 
 
 def plain_value(value: Any) -> Any:

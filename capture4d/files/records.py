@@ -83,8 +83,9 @@ def save_garment(path: str | Path, garment: Garment) -> None:
     )
 
 
-def load_garment(path: str | Path) -> Garment:
-    with ArrayFile(path) as arrays:
+def load_garment(path: str | Path, data: bytes | None = None) -> Garment:
+    """Read a garment; `data` is what the file holds, if it was read already."""
+    with ArrayFile(path, data) as arrays:
         return Garment(
             template=arrays.mesh("template_"),
             loops=arrays.prefixed("loop_"),

@@ -21,7 +21,7 @@ from typing import Any
 from capture4d.errors import InputError, StaleError
 from capture4d.files.atomic import TEMPORARY_SUFFIX, file_digest, plain_value, read_json, write_json
 
-__all__ = ["Stage", "StageResult", "open_stage", "require_complete"]
+__all__ = ["Stage", "StageResult", "open_stage", "require_complete", "result_of"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,6 +166,11 @@ def open_stage(
     if existing is None or existing.get("status") != "running":
         write_json(record_path, record)
     return Stage(folder, record, existing if existing and existing.get("status") == "complete" else None)
+
+
+def result_of(folder: Path, output: Path | None = None) -> StageResult:
+    """What the run that finished a stage returned, as far as its record knows."""
+    return StageResult(output or folder, read_json(folder / "stage.json")["digest"])
 
 
 def require_complete(

@@ -10,10 +10,11 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from functools import partial
 from multiprocessing.connection import wait
 from typing import Any, TypeVar, overload
 
-__all__ = ["WorkerDied", "progress", "run_jobs"]
+__all__ = ["WorkerDied", "progress", "run_jobs", "shared"]
 
 Job = TypeVar("Job")
 Prepared = TypeVar("Prepared")
@@ -22,6 +23,15 @@ Result = TypeVar("Result")
 
 class WorkerDied(RuntimeError):
     """A worker process ended without an answer: killed, or out of memory. Finished frames are on disk."""
+
+
+def shared(value: Prepared) -> Callable[[], Prepared]:
+    """A `prepare` that hands the same value to every process, once each."""
+    return partial(_value, value)
+
+
+def _value(value: Prepared) -> Prepared:
+    return value
 
 
 @overload

@@ -16,7 +16,7 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,22 +25,14 @@ import numpy as np
 from capture4d.body.anny import load_anny
 from capture4d.body.motion_files import read_motion
 from capture4d.body.posed_surface import BodyState
-from capture4d.captures.capture import (
-    Capture,
-    body_digest,
-    capture_digest,
-    read_body,
-    read_capture,
-    read_scan,
-    scan_path,
-)
-from capture4d.captures.take_colours import forget_learned_colours, take_colours
+from capture4d.captures.capture import Capture, read_scan, scan_path
+from capture4d.captures.take_colours import KnownColours, take_colours
 from capture4d.errors import InputError
 from capture4d.files.arrays import ArrayFile
-from capture4d.files.atomic import file_digest, read_json, write_bytes, write_json, write_npz
+from capture4d.files.atomic import file_digest, read_json, read_json_lines, write_bytes, write_json, write_npz
 from capture4d.files.records import load_body, save_body, save_poses
 from capture4d.runs.stage import Stage, StageResult, open_stage
-from capture4d.runs.workers import run_jobs
+from capture4d.runs.workers import progress, run_jobs
 from capture4d.tracking.config import SequenceConfig, TrackingConfig
 from capture4d.tracking.limbs import guessed_limbs, unseen_limbs
 from capture4d.tracking.scan_points import ScanPoints, scan_points
@@ -56,17 +48,16 @@ STARTS = ("search", "rest")
 
 
 def run(
-    capture: Path, output: Path, config: TrackingConfig, *, workers: int = 1, overwrite: bool = False
+    capture: Capture, output: Path, config: TrackingConfig, *, workers: int = 1, overwrite: bool = False
 ) -> StageResult:
     """Track the body through every frame.
 
     Raises:
         InputError: the capture is damaged, none of its scans can be read, or the start is no pose of its body.
     """
-    description = read_capture(capture)
-    upstream = {"capture": capture_digest(description)}
-    if digest := body_digest(description):
-        upstream["body"] = digest
+    upstream = {"capture": capture.digest}
+    if capture.body_digest:
+        upstream["body"] = capture.body_digest
     if config.start not in STARTS:
         start_file = Path(config.start)
         if not start_file.is_file():
@@ -78,105 +69,102 @@ def run(
         schema=SCHEMA,
         config=config,
         upstream=upstream,
-        sources={"capture": capture},
+        sources={"capture": capture.path},
         overwrite=overwrite,
     )
-    _tracker.cache_clear()
-    forget_learned_colours()
     if not (output / "body.npz").is_file():
-        save_body(output / "body.npz", read_body(description) or load_anny())
-    followed = _follow(description, stage, config, workers)
-    _require_found(description, stage, config)
-    shape = _take_shape(stage, description.frame_ids)
-    jobs = [
-        _RefineJob(capture, stage, config, frame_id, shape)
-        for frame_id in stage.pending(description.frame_ids, folder="refined")
-    ]
-    for _ in run_jobs(_refine_frame, jobs, workers=workers, label="refine poses"):
-        pass
+        save_body(output / "body.npz", capture.body or load_anny())
+    pending = stage.pending(capture.frame_ids)
+    to_refine = stage.pending(capture.frame_ids, folder="refined")
+    if pending or to_refine:
+        take = _Take(capture, stage, config, take_colours(capture))
+        if pending:
+            _follow_frames(take, pending)
+        _require_found(take)
+        shape = _take_shape(stage, capture.frame_ids)
+        jobs = [_RefineJob(frame_id, shape) for frame_id in to_refine]
+        prepare = partial(_prepare, take)
+        for _ in run_jobs(_refine_frame, jobs, prepare=prepare, workers=workers, label="refine poses"):
+            pass
     gathered = all((output / name).is_file() for name in ("poses.npz", "metrics.jsonl"))
-    changed = followed or bool(jobs) or not gathered or not stage.was_complete
+    changed = bool(pending or to_refine) or not gathered or not stage.was_complete
     if changed:
-        _gather(description, stage, config, shape)
-    refined = [stage.frame_path(frame_id, folder="refined") for frame_id in description.frame_ids]
-    return stage.finish([output / "body.npz", output / "poses.npz", *refined], changed=changed)
+        _gather(capture, stage, config)
+    refined = [stage.frame_path(frame_id, folder="refined") for frame_id in capture.frame_ids]
+    return stage.finish(
+        [output / "body.npz", output / "poses.npz", *refined],
+        changed=changed,
+        frames=len(capture.frame_ids),
+        failed={
+            record["frame_id"]: "; ".join(record["reasons"])
+            for record in read_json_lines(output / "metrics.jsonl")
+            if record["verdict"] == "lost"
+        },
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Take:
+    """What both passes work on."""
+
+    capture: Capture
+    stage: Stage
+    config: TrackingConfig
+    colours: KnownColours
+
+    def tracker(self) -> Tracker:
+        return Tracker.create(load_body(self.stage.path / "body.npz"), self.config)
+
+    def points(self, frame_id: int) -> tuple[ScanPoints, str]:
+        """Points of a scan, and what is wrong with it: none where it cannot be read, which loses the frame."""
+        colours = self.colours
+        try:
+            scan = colours.flat(read_scan(self.capture, frame_id))
+            paints = tuple(dict.fromkeys(colours.boundary.values()))
+            source = str(scan_path(self.capture, frame_id))
+            return scan_points(scan, colours.garment, paints, self.config.sampling, source=source), ""
+        except InputError as error:
+            return ScanPoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, bool)), str(error)
 
 
 # --- first pass --------------------------------------------------------------------------------------------------
 
 
-def _follow(capture: Capture, stage: Stage, config: TrackingConfig, workers: int) -> bool:
-    """One frame after the other, from where an earlier run stopped; whether there was anything left to do."""
-    frame_ids = capture.frame_ids
-    if not stage.pending(frame_ids):
-        return False
-    job = _FollowJob(capture.path, stage, config)
-    for _ in run_jobs(
-        _follow_frames, [job], workers=min(workers, 1), label="track body", units=lambda _: len(frame_ids),
-        finished=stage.count,
-    ):  # fmt: skip
-        pass
-    return True
-
-
-@dataclass(frozen=True, slots=True)
-class _FollowJob:
-    capture: Path
-    stage: Stage
-    config: TrackingConfig
-
-
-def _follow_frames(job: _FollowJob) -> int:
-    capture, stage = read_capture(job.capture), job.stage
-    tracker = _tracker(stage.path, job.config)
-    pending = set(stage.pending(capture.frame_ids))
+def _follow_frames(take: _Take, frame_ids: Sequence[int]) -> None:
+    """One frame after the other, from where an earlier run stopped."""
+    capture, stage, config = take.capture, take.stage, take.config
+    tracker, pending = take.tracker(), set(frame_ids)
     last = before = None
-    for frame_id in capture.frame_ids:
-        path = stage.frame_path(frame_id)
-        if frame_id in pending:
-            begin = time.process_time()
-            points, fault = _points(capture, frame_id, job.config)
-            if last is not None:
-                followed = tracker.follow(points, last, before)
-            elif fault:
-                followed = tracker.nothing(points)
-            else:
-                followed = tracker.begin(points, _start(tracker, job.config, frame_id))
-            _save_followed(path, followed, time.process_time() - begin)
-        followed = _load_followed(path)
-        if followed.started_from == NOTHING:
-            continue
-        before = last if followed.lost_frames == 0 and last is not None and last.lost_frames == 0 else None
-        last = followed
-    return len(pending)
+    with progress("track body", len(capture.frame_ids), completed=len(capture.frame_ids) - len(pending)) as advance:
+        for frame_id in capture.frame_ids:
+            path = stage.frame_path(frame_id)
+            if frame_id in pending:
+                begin = time.process_time()
+                points, fault = take.points(frame_id)
+                if last is not None:
+                    followed = tracker.follow(points, last, before)
+                elif fault:
+                    followed = tracker.nothing(points)
+                else:
+                    followed = tracker.begin(points, _start(tracker, config, frame_id))
+                _save_followed(path, followed, time.process_time() - begin)
+                advance(1)
+            followed = _load_followed(path)
+            if followed.started_from == NOTHING:
+                continue
+            before = last if followed.lost_frames == 0 and last is not None and last.lost_frames == 0 else None
+            last = followed
 
 
-def _require_found(capture: Capture, stage: Stage, config: TrackingConfig) -> None:
+def _require_found(take: _Take) -> None:
     """See that the first pass had a scan to start from, in this run or an earlier one.
 
     Raises:
         InputError: no scan can be read; about the first.
     """
-    if all(_load_followed(stage.frame_path(frame_id)).started_from == NOTHING for frame_id in capture.frame_ids):
-        raise InputError(_points(capture, capture.frame_ids[0], config)[1])
-
-
-@lru_cache(maxsize=1)
-def _tracker(folder: Path, config: TrackingConfig) -> Tracker:
-    """One per process."""
-    return Tracker.create(load_body(folder / "body.npz"), config)
-
-
-def _points(capture: Capture, frame_id: int, config: TrackingConfig) -> tuple[ScanPoints, str]:
-    """Points of a scan, and what is wrong with it: none where it cannot be read, which loses the frame."""
-    colours = take_colours(capture)
-    try:
-        scan = colours.flat(read_scan(capture, frame_id))
-        paints = tuple(dict.fromkeys(colours.boundary.values()))
-        source = str(scan_path(capture, frame_id))
-        return scan_points(scan, colours.garment, paints, config.sampling, source=source), ""
-    except InputError as error:
-        return ScanPoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, bool)), str(error)
+    frame_ids, stage = take.capture.frame_ids, take.stage
+    if all(_load_followed(stage.frame_path(frame_id)).started_from == NOTHING for frame_id in frame_ids):
+        raise InputError(take.points(frame_ids[0])[1])
 
 
 def _start(tracker: Tracker, config: TrackingConfig, frame_id: int) -> BodyState | None:
@@ -237,20 +225,21 @@ def _take_shape(stage: Stage, frame_ids: tuple[int, ...]) -> tuple[float, ...]:
 
 @dataclass(frozen=True, slots=True)
 class _RefineJob:
-    capture: Path
-    stage: Stage
-    config: TrackingConfig
     frame_id: int
     shape: tuple[float, ...]
 
 
-def _refine_frame(job: _RefineJob) -> None:
-    capture, stage = read_capture(job.capture), job.stage
+def _prepare(take: _Take) -> tuple[_Take, Tracker]:
+    return take, take.tracker()
+
+
+def _refine_frame(prepared: tuple[_Take, Tracker], job: _RefineJob) -> None:
+    take, tracker = prepared
+    capture, stage = take.capture, take.stage
     begin = time.process_time()
-    tracker = _tracker(stage.path, job.config)
     first, start, around = _surroundings(capture, stage, job.frame_id)
     start = replace(start, shape=np.array(job.shape))
-    points, fault = _points(capture, job.frame_id, job.config)
+    points, fault = take.points(job.frame_id)
     refined = tracker.refine(points, start, around, interval_s=1 / capture.fps, lost=first.quality.lost)
     if fault:
         refined = replace(refined, quality=replace(refined.quality, reasons=(fault,)))
@@ -334,8 +323,9 @@ def _with_take(records: Sequence[dict[str, Any]], config: SequenceConfig) -> lis
     return flagged
 
 
-def _gather(capture: Capture, stage: Stage, config: TrackingConfig, shape: tuple[float, ...]) -> None:
+def _gather(capture: Capture, stage: Stage, config: TrackingConfig) -> None:
     """Poses and metrics of all frames."""
+    shape = _take_shape(stage, capture.frame_ids)
     paths = [stage.frame_path(frame_id, folder="refined") for frame_id in capture.frame_ids]
     rotations, translations = [], []
     for path in paths:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Mapping, Sequence
-from functools import lru_cache, partial
+from functools import partial
 from importlib.metadata import version
 from itertools import groupby
-from pathlib import Path
 from typing import Any
 
 import jinja2
@@ -19,11 +18,10 @@ from capture4d.app.drawing.render import Drawn, render
 from capture4d.app.report.metrics import column
 from capture4d.app.report.take import MAX_FLAGGED_ROWS, flat, is_current, joined_chart, shown, spread
 from capture4d.body.skinning import pose_frame, with_shape
-from capture4d.captures.work_folder import ANIMATE, VERDICTS, load_moving_body, load_records, load_registration
-from capture4d.files.atomic import read_json, write_bytes, write_json
-from capture4d.runs.stage import open_stage, require_complete
-from capture4d.runs.workers import run_jobs
-from capture4d.types import Body, PoseSequence, RegisteredSequence
+from capture4d.captures.work_folder import ANIMATE, VERDICTS, WorkFolder
+from capture4d.files.atomic import write_bytes, write_json
+from capture4d.runs.stage import StageResult, open_stage, require_complete, result_of
+from capture4d.runs.workers import run_jobs, shared
 
 __all__ = ["ANIMATION_METRICS", "run"]
 
@@ -47,36 +45,34 @@ ANIMATION_METRICS: Mapping[str, tuple[str, str, str]] = {
 """Unit, better direction and meaning. Unless it says otherwise, it is the mean over the frames."""
 
 
-def run(work: Path, *, workers: int = 1, overwrite: bool = False) -> Path:
-    """Write the report, unless it is there and the animation has not changed; the path of its page.
+def run(work: WorkFolder, *, workers: int = 1, overwrite: bool = False) -> StageResult:
+    """Write the report, unless it is there and the animation has not changed; its page is the result's path.
 
     Raises:
         InputError: the animation is unfinished.
     """
-    folder = work / "report"
-    command = f"capture4d animate MODEL --poses FILE --output {work}"
-    digest = require_complete(work / "registration", ANIMATE, command)
+    folder = work.path / "report"
+    command = f"capture4d animate MODEL --poses FILE --output {work.path}"
+    digest = require_complete(work.path / "registration", ANIMATE, command)
     current = {"schema": SCHEMA, "config": {}, "upstream": {"registration": digest}}
     if not overwrite and is_current(folder, current):
-        return folder / "index.html"
+        return result_of(folder, folder / "index.html")
     stale = (folder / "stage.json").exists()
     stage = open_stage(folder, name="report", schema=SCHEMA, config={}, upstream=current["upstream"], overwrite=stale)
-    records = load_records(work / "registration")
+    records = work.records
     summary = summarise(records)
     rows = spread(len(records), PICTURES)
-    sequence = load_registration(work / "registration")
+    sequence = work.registered
     x, y, z = np.max([np.ptp(sequence.vertices[row], axis=0) for row in rows], axis=0).tolist()
-    _loaded.cache_clear()
-    draw = partial(_draw_row, work, Framing((1.3 * x, 1.15 * y, 1.3 * z)))
-    pictures = dict(run_jobs(draw, rows, workers=workers, label="draw"))
+    draw = partial(_draw_row, framing=Framing((1.3 * x, 1.15 * y, 1.3 * z)))
+    pictures = dict(run_jobs(draw, rows, prepare=shared(work), workers=workers, label="draw"))
     metrics = [
         {"key": key, "value": value, "unit": ANIMATION_METRICS[key][0], "better": ANIMATION_METRICS[key][1]}
         for key, value in summary.items()
     ]
-    write_json(folder / "metrics.json", {"metrics": metrics, "capture": work.name, "frames": len(records)})
-    write_bytes(folder / "index.html", _page(work, records, summary, pictures, sequence).encode())
-    stage.finish([])
-    return folder / "index.html"
+    write_json(folder / "metrics.json", {"metrics": metrics, "capture": work.path.name, "frames": len(records)})
+    write_bytes(folder / "index.html", _page(work, records, summary, pictures).encode())
+    return stage.finish([], output=folder / "index.html")
 
 
 def summarise(records: Sequence[Mapping[str, Any]]) -> dict[str, float]:
@@ -92,14 +88,9 @@ def summarise(records: Sequence[Mapping[str, Any]]) -> dict[str, float]:
             if key in special or key in records[0]}  # fmt: skip
 
 
-@lru_cache(maxsize=1)
-def _loaded(work: Path) -> tuple[RegisteredSequence, Body, PoseSequence]:
-    return load_registration(work / "registration"), *load_moving_body(work)
-
-
-def _draw_row(work: Path, framing: Framing, row: int) -> tuple[int, list[list[Panel]]]:
+def _draw_row(work: WorkFolder, row: int, *, framing: Framing) -> tuple[int, list[list[Panel]]]:
     """The garment on the body, from both sides."""
-    sequence, body, poses = _loaded(work)
+    sequence, (body, poses) = work.registered, work.require_posed_body()
     vertices = np.array(sequence.vertices[row])
     posed = pose_frame(with_shape(body, poses.shape), poses, row).vertices().astype(np.float32)
     drawn = [
@@ -114,21 +105,20 @@ def _draw_row(work: Path, framing: Framing, row: int) -> tuple[int, list[list[Pa
 
 
 def _page(
-    work: Path,
+    work: WorkFolder,
     records: Sequence[Mapping[str, Any]],
     summary: Mapping[str, float],
     pictures: Mapping[int, list[list[Panel]]],
-    sequence: RegisteredSequence,
 ) -> str:
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("capture4d.app.report", "."), autoescape=True, undefined=jinja2.StrictUndefined
     )
     flagged = [record for record in records if record["verdict"] != "good"]
     counts = {verdict: sum(record["verdict"] == verdict for record in records) for verdict in VERDICTS}
-    stage, poses = read_json(work / "registration" / "stage.json"), load_moving_body(work)[1]
-    template = sequence.garment.template
+    stage, poses = work.stages["registration"], work.require_posed_body()[1]
+    template = work.registered.garment.template
     return environment.get_template("report.html.jinja").render(
-        title=work.resolve().name,
+        title=work.path.resolve().name,
         subtitle=f"{len(records)} frames, {len(records) / poses.fps:.1f} s at {poses.fps:g} fps; a learned garment of "
         f"{len(template.vertices):,} vertices on a body of shape "
         f"{', '.join(f'{value:.2g}' for value in poses.shape[:4])}.",

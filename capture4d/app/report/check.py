@@ -1,15 +1,15 @@
-"""The verdict of `capture4d check`: an exit code, JSON for machines, a table for people."""
+"""The verdict of `capture4d check`: a status, JSON for machines, a table for people."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from capture4d.preflight.stage import Checked
 from capture4d.preflight.verdict import Verdict
 
-__all__ = ["as_json", "exit_code", "print_table"]
+__all__ = ["as_json", "print_table", "status"]
 
 LEARNED = (
     "No garment_colour is given: extract and track will learn the colours from the scans. "
@@ -17,9 +17,14 @@ LEARNED = (
 )
 
 
-def exit_code(verdict: Verdict) -> int:
-    """0 clean, 1 warnings, 2 errors."""
-    return max((2 if finding.severity == "error" else 1 for finding in verdict.findings), default=0)
+Status = Literal["clean", "warnings", "errors"]
+
+
+def status(verdict: Verdict) -> Status:
+    """The worst that was found."""
+    if not verdict.findings:
+        return "clean"
+    return "errors" if any(finding.severity == "error" for finding in verdict.findings) else "warnings"
 
 
 def as_json(checked: Checked, *, fixed: Path | None = None) -> dict[str, Any]:
@@ -27,7 +32,7 @@ def as_json(checked: Checked, *, fixed: Path | None = None) -> dict[str, Any]:
     return {
         "format": 1,
         "capture": str(checked.take.path),
-        "status": ("clean", "warnings", "errors")[exit_code(checked.verdict)],
+        "status": status(checked.verdict),
         "frames": len(checked.take.files),
         "frames_checked": checked.frames,
         "colours": "learned" if _learns(checked) else "given",

@@ -21,11 +21,11 @@ from capture4d.app.drawing.panels import VIEWS, Framing, Panel, data_uri, no_sca
 from capture4d.app.drawing.render import Drawn, render
 from capture4d.app.report.calibration import calibration_charts, calibration_tiles
 from capture4d.app.report.metrics import column
-from capture4d.body.skinning import pose_frame, with_shape
-from capture4d.captures.capture import Capture, read_rig
+from capture4d.body.skinning import ShapedBody, pose_frame, with_shape
+from capture4d.captures.capture import Capture
 from capture4d.captures.garment_scans import load_garment_scan
 from capture4d.captures.take_colours import KnownColours, take_colours
-from capture4d.captures.work_folder import load_tracking
+from capture4d.captures.work_folder import WorkFolder, load_tracking
 from capture4d.colours.labels import classify_colours, settle_labels
 from capture4d.errors import InputError
 from capture4d.files.arrays import ArrayFile
@@ -84,7 +84,7 @@ def calibration(capture: Capture, work: Path) -> Calibration | None:
         section = Section(calibration_tiles(report), calibration_charts(report))
         page = found[0].with_name("calibration.html")
         return Calibration(section, f"{counts}; {report['board']}. Everything is in {page}.")
-    rig = read_rig(capture)
+    rig = capture.rig
     if rig is None:
         return None
     centres = -np.einsum("cba,cb->ca", rig.T_camera_world[:, :3, :3], rig.T_camera_world[:, :3, 3])
@@ -239,24 +239,49 @@ class StagePictures:
     tracking: Sequence[Panel]
 
 
-def draw_stages(
-    work: Path, capture: Capture, registered: RegisteredSequence, rows: Sequence[int], *, workers: int
-) -> list[StagePictures]:
+def draw_stages(work: WorkFolder, capture: Capture, rows: Sequence[int], *, workers: int) -> list[StagePictures]:
     """What was cut out and what was tracked, in the frames at these positions."""
-    loops = {int(row): _loop_places(registered, row) for row in rows}
-    extraction = work / "garment" / "colours.json"
+    loops = {int(row): _loop_places(work.registered, row) for row in rows}
+    extraction = work.path / "garment" / "colours.json"
     learned = extraction.is_file() and bool(read_json(extraction)["learned"])
-    draw = partial(_draw_row, work, capture, take_colours(capture, learn=learned), loops)
-    return sorted(run_jobs(draw, list(rows), workers=workers, label="draw stages"), key=lambda each: each.row)
+    prepare = partial(_Drawing.open, work.path, capture, take_colours(capture, learn=learned), loops)
+    found = run_jobs(_draw_row, list(rows), prepare=prepare, workers=workers, label="draw stages")
+    return sorted(found, key=lambda each: each.row)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Drawing:
+    """What all frames are drawn with."""
+
+    work: Path
+    capture: Capture
+    colours: KnownColours
+    loops: Mapping[int, list[np.ndarray]]
+    """Places of the registered template's border loops, by row."""
+    tracked: tuple[ShapedBody, PoseSequence] | None
+
+    @staticmethod
+    def open(work: Path, capture: Capture, colours: KnownColours, loops: Mapping[int, list[np.ndarray]]) -> _Drawing:
+        tracked = None
+        if (work / "body" / "poses.npz").is_file():
+            body, poses = load_tracking(work / "body")
+            tracked = with_shape(body, poses.shape), poses
+        return _Drawing(work, capture, colours, loops, tracked)
+
+    def tracked_body(self, frame_id: int) -> Mesh | None:
+        if self.tracked is None:
+            return None
+        shaped, poses = self.tracked
+        posed = pose_frame(shaped, poses, int(np.flatnonzero(poses.frame_ids == frame_id)[0]))
+        return shaped.body.template.with_vertices(posed.vertices().astype(np.float32))
 
 
 def _loop_places(registered: RegisteredSequence, row: int) -> list[np.ndarray]:
     return [np.array(registered.vertices[row][loop]) for loop in registered.garment.loops.values()]
 
 
-def _draw_row(
-    work: Path, capture: Capture, colours: KnownColours, loops: Mapping[int, list[np.ndarray]], row: int
-) -> StagePictures:
+def _draw_row(drawing: _Drawing, row: int) -> StagePictures:
+    capture, colours = drawing.capture, drawing.colours
     frame_id = capture.frame_ids[row]
     scan = readable_scan(capture, frame_id)
     if scan is None:
@@ -266,8 +291,9 @@ def _draw_row(
     labels = settle_labels(scan.mesh.faces, found)
     painted = LABELS[np.minimum(labels, 2)]
     cloth = scan.mesh.vertices[labels > 0] if (labels > 0).any() else scan.mesh.vertices
-    borders = _border_dots(work / "garment" / "frames" / f"{frame_id:06d}.npz", frame_id, loops[row])
-    tracked = _tracked_body(work / "body", frame_id)
+    garment = drawing.work / "garment" / "frames" / f"{frame_id:06d}.npz"
+    borders = _border_dots(garment, frame_id, drawing.loops[row])
+    tracked = drawing.tracked_body(frame_id)
     extraction, tracking = [], []
     for direction in VIEWS:
         view = _framing(cloth).view(cloth, direction)
@@ -286,15 +312,6 @@ def _draw_row(
 def _framing(vertices: np.ndarray) -> Framing:
     x, y, z = np.ptp(vertices, axis=0).tolist()
     return Framing((x, y, z))
-
-
-def _tracked_body(folder: Path, frame_id: int) -> Mesh | None:
-    if not (folder / "poses.npz").is_file():
-        return None
-    body, poses = load_tracking(folder)
-    row = int(np.flatnonzero(poses.frame_ids == frame_id)[0])
-    posed = pose_frame(with_shape(body, poses.shape), poses, row)
-    return body.template.with_vertices(posed.vertices().astype(np.float32))
 
 
 def _border_dots(path: Path, frame_id: int, loops: Sequence[np.ndarray]) -> list[Drawn]:

@@ -9,7 +9,7 @@ import math
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import lru_cache, partial
+from functools import cached_property
 from importlib.metadata import version
 from itertools import groupby
 from pathlib import Path
@@ -34,12 +34,11 @@ from capture4d.app.report.stages import (
 )
 from capture4d.captures.capture import Capture, read_capture
 from capture4d.captures.truth import TruthModel, read_truth_model, read_truth_vertices
-from capture4d.captures.work_folder import VERDICTS, capture_path, load_records, load_registration
+from capture4d.captures.work_folder import VERDICTS, WorkFolder
 from capture4d.evaluation import correspondence_errors, material_points
 from capture4d.files.atomic import read_json, write_bytes, write_json
-from capture4d.runs.stage import open_stage, require_complete
-from capture4d.runs.workers import run_jobs
-from capture4d.types import RegisteredSequence
+from capture4d.runs.stage import StageResult, open_stage, require_complete, result_of
+from capture4d.runs.workers import run_jobs, shared
 
 __all__ = ["MAX_FLAGGED_ROWS", "ReportConfig", "flat", "is_current", "joined_chart", "run", "shown", "spread"]
 
@@ -100,54 +99,48 @@ class ReportConfig:
 
 
 def run(
-    work: Path,
-    *,
-    capture: Path | None = None,
+    work: WorkFolder,
     config: ReportConfig = ReportConfig(),
+    *,
+    capture: Capture | None = None,
     workers: int = 1,
     overwrite: bool = False,
-) -> Path:
-    """Write the report, unless it is there and what it shows has not changed; the path of its page.
+) -> StageResult:
+    """Write the report, unless it is there and what it shows has not changed; its page is the result's path.
 
     Args:
-        work: folder with a finished registration/.
-        capture: the capture folder, if it has moved since.
+        work: with a finished registration/.
+        capture: the capture, if it has moved since.
     Raises:
         InputError: the registration is unfinished, or the capture is not where it was.
     """
-    folder = work / "report"
-    place = capture_path(work) if capture is None else capture
-    digest = require_complete(work / "registration", "register", f"capture4d register {place} --output {work}")
-    upstream = {"registration": digest}
-    compared = comparison_digest(work)
+    folder = work.path / "report"
+    place = work.capture_path if capture is None else capture.path
+    command = f"capture4d register {place} --output {work.path}"
+    upstream = {"registration": require_complete(work.path / "registration", "register", command)}
+    compared = comparison_digest(work.path)
     if compared is not None:
         upstream["compare"] = compared
     current = {"schema": SCHEMA, "config": asdict(config), "upstream": upstream}
     if not overwrite and is_current(folder, current):
-        return folder / "index.html"
-    description = read_capture(place)
+        return result_of(folder, folder / "index.html")
     stale = (folder / "stage.json").exists()
     stage = open_stage(folder, name="report", schema=SCHEMA, config=config, upstream=upstream, overwrite=stale)
-    records = load_records(work / "registration")
-    _measure_truth(work, description, records, config, workers)
-    tracked = tracking(description, work)
+    scene = _Scene(work, capture or read_capture(place))
+    records = [dict(record) for record in work.records]
+    _measure_truth(scene, records, config, workers)
+    tracked = tracking(scene.capture, work.path)
     summary = summarise(records)
     if tracked is not None:
         summary |= tracked.metrics
     heat = {"fit error": summary.get("fit_p95_mm"), "correspondence error": summary.get("correspondence_p95_mm")}
     scales = {title: _round_up(value) for title, value in heat.items() if value is not None}
-    rows = _draw(work, description, _drawn_rows(records, config.pictures), scales, workers)
+    rows = _draw(scene, _drawn_rows(records, config.pictures), scales, workers)
     stages = Stages(
-        calibration(description, work),
+        calibration(scene.capture, work.path),
         tracked,
-        draw_stages(
-            work,
-            description,
-            _registered(work / "registration"),
-            spread(len(records), config.stage_pictures),
-            workers=workers,
-        ),
-        comparison(work),
+        draw_stages(work, scene.capture, spread(len(records), config.stage_pictures), workers=workers),
+        comparison(work.path),
     )
     write_json(
         folder / "metrics.json",
@@ -156,80 +149,84 @@ def run(
                 {"key": key, "value": value, "unit": METRICS[key][0], "better": METRICS[key][1]}
                 for key, value in summary.items()
             ],
-            "capture": description.name,
+            "capture": scene.capture.name,
             "frames": len(records),
         },
     )
-    page = _page(work, description, records, summary, scales, rows, stages)
+    page = _page(scene, records, summary, scales, rows, stages)
     write_bytes(folder / "index.html", page.encode())
-    stage.finish([])  # the report holds times, which differ between equal runs; nothing is made from it
-    return folder / "index.html"
+    # the report holds times, which differ between equal runs; nothing is made from it
+    return stage.finish([], output=folder / "index.html")
 
 
 # --- frames ------------------------------------------------------------------------------------------------------
 
 
-@lru_cache(maxsize=1)
-def _registered(folder: Path) -> RegisteredSequence:
-    return load_registration(folder)
+@dataclass(frozen=True, eq=False)
+class _Scene:
+    """What pictures and measures are made of; a process reads each part once."""
+
+    work: WorkFolder
+    capture: Capture
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"work": self.work, "capture": self.capture}
+
+    @cached_property
+    def truth(self) -> TruthModel | None:
+        return read_truth_model(self.capture)
 
 
-@lru_cache(maxsize=1)
-def _model(capture: Path) -> TruthModel | None:
-    return read_truth_model(read_capture(capture))
-
-
-def _measure_truth(
-    work: Path, capture: Capture, records: list[dict[str, Any]], config: ReportConfig, workers: int
-) -> None:
+def _measure_truth(scene: _Scene, records: list[dict[str, Any]], config: ReportConfig, workers: int) -> None:
     """Add the measures against truth to the records of the frames that have them."""
-    _registered.cache_clear()
-    _model.cache_clear()
-    if _model(capture.path) is None:
+    if scene.truth is None:
         return
     rows = spread(len(records), config.truth_frames)
-    measure = partial(_measure_row, work, capture)
-    for row, measures in run_jobs(measure, rows, workers=workers, label="measure against truth"):
+    for row, measures in run_jobs(
+        _measure_row, rows, prepare=shared(scene), workers=workers, label="measure against truth"
+    ):
         records[row].update(measures)
 
 
-def _measure_row(work: Path, capture: Capture, row: int) -> tuple[int, dict[str, float]]:
-    registered, model = _registered(work / "registration"), _model(capture.path)
+def _measure_row(scene: _Scene, row: int) -> tuple[int, dict[str, float]]:
+    registered, model = scene.work.registered, scene.truth
     assert model is not None
-    return row, truth_measures(registered, row, model, read_truth_vertices(capture, int(registered.frame_ids[row])))
+    vertices = read_truth_vertices(scene.capture, int(registered.frame_ids[row]))
+    return row, truth_measures(registered, row, model, vertices)
 
 
-def _draw(
-    work: Path, capture: Capture, rows: list[int], scales: Mapping[str, float], workers: int
-) -> dict[int, list[list[Panel]]]:
-    registered = _registered(work / "registration")
+def _draw(scene: _Scene, rows: list[int], scales: Mapping[str, float], workers: int) -> dict[int, list[list[Panel]]]:
+    registered = scene.work.registered
     x, y, z = np.max([np.ptp(vertices, axis=0) for vertices in registered.vertices], axis=0).tolist()
-    framing = Framing((x, y, z))
-    draw = partial(_draw_row, work, capture, framing, dict(scales))
-    return dict(run_jobs(draw, rows, workers=workers, label="draw"))
+    jobs = [_DrawJob(row, Framing((x, y, z)), scales) for row in rows]
+    return dict(run_jobs(_draw_row, jobs, prepare=shared(scene), workers=workers, label="draw"))
 
 
-def _draw_row(
-    work: Path, capture: Capture, framing: Framing, scales: dict[str, float], row: int
-) -> tuple[int, list[list[Panel]]]:
-    registered, model = _registered(work / "registration"), _model(capture.path)
+@dataclass(frozen=True, slots=True, eq=False)
+class _DrawJob:
+    row: int
+    framing: Framing
+    scales: Mapping[str, float]
+
+
+def _draw_row(scene: _Scene, job: _DrawJob) -> tuple[int, list[list[Panel]]]:
+    row, registered, model, capture = job.row, scene.work.registered, scene.truth, scene.capture
     frame_id, vertices = int(registered.frame_ids[row]), np.array(registered.vertices[row])
     errors = {}
-    if "fit error" in scales:
-        errors["fit error"] = (1e3 * registered.residual_m[row].astype(float), scales["fit error"])
-    if model is not None and "correspondence error" in scales:
+    if "fit error" in job.scales:
+        errors["fit error"] = (1e3 * registered.residual_m[row].astype(float), job.scales["fit error"])
+    if model is not None and "correspondence error" in job.scales:
         fine = read_truth_vertices(capture, frame_id)
         places = material_points(fine, model.fine.faces, model.template_faces, model.template_barycentric)
         values = 1e3 * correspondence_errors(vertices, places)
-        errors["correspondence error"] = (values, scales["correspondence error"])
-    colours = dict(capture.boundary_colours)
+        errors["correspondence error"] = (values, job.scales["correspondence error"])
     return row, draw_frame(
         readable_scan(capture, frame_id),
         registered.garment,
         vertices,
-        framing,
+        job.framing,
         errors_mm=errors,
-        border_colours=colours,
+        border_colours=dict(capture.boundary_colours),
     )
 
 
@@ -252,21 +249,21 @@ def spread(total: int, count: int) -> list[int]:
 
 
 def _page(
-    work: Path,
-    capture: Capture,
+    scene: _Scene,
     records: Sequence[Mapping[str, Any]],
     summary: Mapping[str, float | None],
     scales: Mapping[str, float],
     pictures: Mapping[int, list[list[Panel]]],
     stages: Stages,
 ) -> str:
+    work, capture = scene.work, scene.capture
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("capture4d.app.report", "."), autoescape=True, undefined=jinja2.StrictUndefined
     )
     flagged = [record for record in records if record["verdict"] != "good"]
     counts = {verdict: sum(record["verdict"] == verdict for record in records) for verdict in VERDICTS}
     seconds = (capture.frame_ids[-1] - capture.frame_ids[0] + 1) / capture.fps
-    template = _registered(work / "registration").garment.template
+    template = work.registered.garment.template
     return environment.get_template("report.html.jinja").render(
         title=capture.name,
         subtitle=f"{len(records)} frames, {seconds:.1f} s at {capture.fps:g} fps; a template of "
@@ -313,7 +310,7 @@ def _page(
             for key, value in summary.items()
         ],
         run=list(_run_rows(work, capture, records)),
-        settings=list(flat(read_json(work / "registration" / "stage.json")["config"])),
+        settings=list(flat(work.stages["registration"]["config"])),
     )
 
 
@@ -374,9 +371,8 @@ def _caption(record: Mapping[str, Any]) -> str:
     return " · ".join([*parts, *record["reasons"]])
 
 
-def _run_rows(work: Path, capture: Capture, records: Sequence[Mapping[str, Any]]) -> Sequence[tuple[str, str]]:
-    record = read_json(work / "registration" / "stage.json")
-    garment = _registered(work / "registration").garment
+def _run_rows(work: WorkFolder, capture: Capture, records: Sequence[Mapping[str, Any]]) -> Sequence[tuple[str, str]]:
+    record, garment = work.stages["registration"], work.registered.garment
     cpu = column(records, "cpu_s")
     loops = ", ".join(f"{name} ({len(loop)})" for name, loop in garment.loops.items()) or "none"
     return [
@@ -386,7 +382,7 @@ def _run_rows(work: Path, capture: Capture, records: Sequence[Mapping[str, Any]]
         ("Border loops", loops),
         ("Registered", f"{record.get('started', '')} to {record.get('finished', '')}"),
         ("CPU time", f"{np.nansum(cpu):.1f} s in all, {np.nanmedian(cpu):.2f} s a frame"),
-        ("Command", f"capture4d run {capture.path} --output {work}"),
+        ("Command", f"capture4d run {capture.path} --output {work.path}"),
         ("Digest", str(record.get("digest", ""))[:16]),
         ("Versions", ", ".join(f"{name} {version(name)}" for name in ("capture4d", "numpy", "scipy", "open3d"))),
         ("Machine", f"{platform.system()} {platform.machine()}, Python {platform.python_version()}"),

@@ -4,7 +4,7 @@ import shutil
 import numpy as np
 import pytest
 
-from capture4d.captures.capture import read_capture, read_scan, read_template
+from capture4d.captures.capture import read_capture, read_scan
 from capture4d.captures.truth import read_truth_frame, read_truth_model
 from capture4d.errors import InputError
 from capture4d.evaluation import material_points
@@ -76,7 +76,7 @@ def test_a_sequence_becomes_an_ordinary_capture_with_truth(capture):
 
 def test_the_template_is_the_first_mesh_and_maps_to_itself(capture):
     description = read_capture(capture)
-    garment, model = read_template(description), read_truth_model(description)
+    garment, model = description.template, read_truth_model(description)
     assert set(garment.loops) == set(model.loops)
     truth = read_truth_frame(description, 25)
     points = material_points(truth.vertices, model.fine.faces, model.template_faces, model.template_barycentric)

@@ -1,6 +1,7 @@
 """The capture folder: what is written is read, and what is wrong is named."""
 
 import json
+import pickle
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,13 +12,10 @@ import pytest
 from capture4d.captures.capture import (
     Capture,
     capture_digest,
-    motion_digest,
     read_capture,
-    read_poses,
     read_scan,
-    read_template,
     scan_digest,
-    template_digest,
+    scan_path,
     write_capture_description,
     write_scan,
 )
@@ -127,7 +125,26 @@ def test_what_is_missing_is_named(capture: Capture, tmp_path: Path):
     with pytest.raises(InputError, match=r"capture\.json: no such file"):
         read_capture(tmp_path / "empty")
     with pytest.raises(InputError, match=r"template\.npz: no such file"):
-        read_template(capture)
+        _ = capture.template
+
+
+def test_a_capture_is_as_it_was_when_it_was_opened(capture: Capture):
+    save_poses(capture.path / "poses.npz", poses_of(FRAMES))
+    opened = read_capture(capture.path)
+    assert opened.poses is opened.poses
+    digest = opened.digest
+    (capture.path / "capture.json").write_text("{}")
+    assert (opened.digest, capture_digest(opened)) == (digest, digest)
+    travelled = pickle.loads(pickle.dumps(opened))
+    assert (travelled.digest, travelled.frame_ids) == (digest, FRAMES)
+
+
+def test_of_two_files_of_a_frame_the_ply_counts(capture: Capture):
+    write_mesh(capture.path / "scans" / "000012.obj", SQUARE, colours=COLOURS)
+    write_mesh(capture.path / "scans" / "13.obj", SQUARE, colours=COLOURS)
+    edit_description(capture, lambda entries: entries.update(frames=[12, 13]))
+    opened = read_capture(capture.path)
+    assert [scan_path(opened, frame_id).name for frame_id in opened.frame_ids] == ["000012.ply", "13.obj"]
 
 
 def test_a_scan_without_colours_is_named(capture: Capture):
@@ -137,9 +154,9 @@ def test_a_scan_without_colours_is_named(capture: Capture):
 
 
 def test_poses_come_in_the_order_of_the_scans(capture: Capture):
-    assert read_poses(capture) is None
+    assert capture.poses is None
     save_poses(capture.path / "poses.npz", poses_of((15, 11, 99, 12)))
-    poses = read_poses(capture)
+    poses = replace(capture).poses
     assert poses is not None
     assert poses.frame_ids.tolist() == list(FRAMES)
     assert poses.translations[:, 0].tolist() == [3, 9, 0]
@@ -149,7 +166,7 @@ def test_poses_come_in_the_order_of_the_scans(capture: Capture):
 def test_poses_that_do_not_match_the_scans_are_named(capture: Capture):
     save_poses(capture.path / "poses.npz", poses_of((11, 12, 13)))
     with pytest.raises(InputError, match=r"poses\.npz: expected a pose for each of 3 scans.*frame 15 first"):
-        read_poses(capture)
+        _ = capture.poses
 
 
 def test_the_digest_of_a_capture_follows_its_scans_and_its_description(capture: Capture):
@@ -186,23 +203,23 @@ def test_the_digest_of_a_scan_follows_its_ends(size: int, tmp_path: Path):
 @pytest.mark.parametrize("suffix", [".npz", ".obj", ".ply", ".glb"])
 def test_a_template_of_any_format_has_a_digest(suffix: str, capture: Capture):
     with pytest.raises(InputError, match="registration needs a template"):
-        template_digest(capture)
+        _ = capture.template_digest
     digests = set()
     for text in ("one", "two"):
         (capture.path / f"template{suffix}").write_text(text)
-        digests.add(template_digest(capture))
+        digests.add(replace(capture).template_digest)
     assert len(digests) == 2
 
 
 def test_motion_is_poses_and_the_body_they_move(capture: Capture):
     (capture.path / "body.npz").write_text("one")
-    assert motion_digest(capture) is None
+    assert capture.motion_digest is None
     (capture.path / "poses.npz").write_text("poses")
-    digests = [motion_digest(capture)]
+    digests = [replace(capture).motion_digest]
     (capture.path / "body.npz").write_text("two")
-    digests.append(motion_digest(capture))
+    digests.append(replace(capture).motion_digest)
     (capture.path / "body.npz").unlink()
-    digests.append(motion_digest(capture))
+    digests.append(replace(capture).motion_digest)
     assert len(set(digests)) == 3
 
 
@@ -285,6 +302,6 @@ def test_a_damaged_or_foreign_archive_is_named(tmp_path: Path):
 
 def test_a_bare_mesh_is_a_template_with_its_loops(capture: Capture):
     write_mesh(capture.path / "template.obj", SQUARE)
-    garment = read_template(capture)
+    garment = capture.template
     assert {name: len(loop) for name, loop in garment.loops.items()} == {"border_0": 4}
     assert garment.skin_weights is None

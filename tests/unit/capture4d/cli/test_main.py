@@ -12,13 +12,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from capture4d import pipeline
 from capture4d.captures.garment_scans import load_garment_scan
-from capture4d.cli.main import main
+from capture4d.cli.main import COMMANDS, main
 from capture4d.errors import InputError
 from capture4d.files.atomic import write_bytes, write_json
 from capture4d.files.meshes import read_mesh, write_mesh
 from capture4d.files.ply import ply_bytes
 from capture4d.files.records import load_garment, save_garment, save_poses
+from capture4d.runs.stage import StageResult
 from capture4d.types import Mesh, PoseSequence
 
 
@@ -72,8 +74,7 @@ def test_help_names_every_command_and_loads_nothing_heavy():
         "sys.exit(code or bool(heavy) and f'loaded {heavy}')"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    for name in ("demo", "synth", "extract", "register", "run", "report"):
-        assert f"\n  {name} " in done.stdout
+    assert {line.split("  ")[1] for line in done.stdout.splitlines() if line.startswith("  ")} == set(COMMANDS)
 
 
 @pytest.mark.parametrize(
@@ -101,11 +102,15 @@ def test_a_near_miss_gets_a_hint(capsys: pytest.CaptureFixture[str]):
 
 
 def test_a_preset_is_what_single_options_start_from(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    import registration.stage
     from registration.config import PAPER, GraphConfig, RegistrationConfig
 
     seen = []
-    monkeypatch.setattr(registration.stage, "run", lambda *args, **options: seen.append(args[3]))
+
+    def register(capture: Path, work: Path, config: RegistrationConfig, **_: object) -> StageResult:
+        seen.append(config)
+        return StageResult(work, "")
+
+    monkeypatch.setattr(pipeline, "register", register)
     for options in ([], ["--preset", "paper"], ["--preset=paper", "--graph.nodes", "99"]):
         run("register", "capture", "--output", tmp_path, *options)
     assert seen[0] == RegistrationConfig()
@@ -116,7 +121,11 @@ def test_a_preset_is_what_single_options_start_from(monkeypatch: pytest.MonkeyPa
 @pytest.mark.parametrize(
     ("error", "code", "said"),
     [
-        (InputError("scan.ply: expected cloth,\nfound none"), 1, "capture4d: scan.ply: expected cloth, found none\n"),
+        (
+            InputError("expected cloth,\nfound none", where="scan.ply"),
+            1,
+            "capture4d: scan.ply: expected cloth, found none\n",
+        ),
         (PermissionError(13, "Permission denied", "out/x.npz"), 1, "capture4d: out/x.npz: Permission denied\n"),
         (
             OSError(28, "No space left on device", "out/x.npz"),
@@ -128,12 +137,10 @@ def test_a_preset_is_what_single_options_start_from(monkeypatch: pytest.MonkeyPa
 def test_what_is_the_users_to_repair_is_one_line(
     error: Exception, code: int, said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    import capture4d.extraction.stage
-
     def fail(*_: object, **__: object) -> None:
         raise error
 
-    monkeypatch.setattr(capture4d.extraction.stage, "run", fail)
+    monkeypatch.setattr(pipeline, "extract", fail)
     assert run("extract", "capture", "--output", "work") == code
     written = capsys.readouterr().err
     assert written.endswith(said)
@@ -141,12 +148,10 @@ def test_what_is_the_users_to_repair_is_one_line(
 
 
 def test_our_own_bugs_keep_their_traceback(monkeypatch: pytest.MonkeyPatch):
-    import capture4d.extraction.stage
-
     def fail(*_: object, **__: object) -> None:
         raise ZeroDivisionError
 
-    monkeypatch.setattr(capture4d.extraction.stage, "run", fail)
+    monkeypatch.setattr(pipeline, "extract", fail)
     with pytest.raises(ZeroDivisionError):
         main(["extract", "capture", "--output", "work"])
 
@@ -188,7 +193,13 @@ def test_a_damaged_scan_is_flagged_and_the_take_goes_on(
             assert said in str(arrays["reason"])
         for frame in ("000005", "000007"):
             assert len(load_garment_scan(folder / "garment" / "frames" / f"{frame}.npz", int(frame)).mesh.vertices)
-    assert run("register", tube_capture, "--output", folder, "--workers", "1") == 0
+    register = ("register", tube_capture, "--output", folder, "--workers", "1")
+    assert run(*register) == 3
+    assert "1 of 3 frames failed (33.3 %, more than the 5 % allowed); frame 6: " in capsys.readouterr().err
+    assert run(*register, "--max-failed", "34") == 0
+    assert "--max-failed: expected a percentage between 0 and 100, found 101" in fails(
+        capsys, *register, "--max-failed", "101"
+    )
     records = [json.loads(line) for line in (folder / "registration" / "metrics.jsonl").read_text().splitlines()]
     assert [record["verdict"] == "failed" for record in records] == [False, True, False]
     assert said in records[1]["reasons"][0]
@@ -360,7 +371,7 @@ def test_run_does_every_stage_and_a_second_run_nothing(
 def test_run_reports_a_take_with_a_scan_that_is_cut_short(tube_capture: Path, work: Path):
     path = tube_capture / "scans" / "000006.ply"
     path.write_bytes(path.read_bytes()[:1000])
-    assert run("run", tube_capture, "--output", work, "--workers", "1") == 0
+    assert run("run", tube_capture, "--output", work, "--workers", "1") == 3
     page = (work / "report" / "index.html").read_text()
     assert "000006.ply: cut off" in page
     assert 'alt="no scan, frame 6"' in page
@@ -372,7 +383,7 @@ def test_run_reports_a_take_in_which_every_frame_failed(tube_capture: Path, work
     template = load_garment(tube_capture / "template.npz")
     far = template.template.with_vertices(template.template.vertices + np.float32(9))
     save_garment(tube_capture / "template.npz", replace(template, template=far))
-    assert run("run", tube_capture, "--output", work, "--workers", "1") == 0
+    assert run("run", tube_capture, "--output", work, "--workers", "1", "--max-failed", "99") == 3
     metrics = json.loads((work / "report" / "metrics.json").read_text())["metrics"]
     assert {entry["key"]: entry["value"] for entry in metrics}["frames_failed"] == 3
 
@@ -405,9 +416,9 @@ def test_register_mesh_keeps_the_templates_faces_and_measures(
     ("limits", "code"),
     [
         (["fit_mean_mm=1.0"], 0),
-        (["fit_mean_mm=0.5"], 1),
-        (["fit_mean_mm=1.0", "boundary_mean_mm=1.0"], 1),
-        (["lost=1e9"], 1),  # null: not measured
+        (["fit_mean_mm=0.5"], 3),
+        (["fit_mean_mm=1.0", "boundary_mean_mm=1.0"], 3),
+        (["lost=1e9"], 3),  # null: not measured
         (["fit=1"], 1),
         (["fit_mean_mm"], 1),
     ],
@@ -415,14 +426,12 @@ def test_register_mesh_keeps_the_templates_faces_and_measures(
 def test_the_report_gates(
     limits: list[str], code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    from capture4d import pipeline
-
     values = {"fit_mean_mm": 0.7, "boundary_mean_mm": 2.0, "lost": None}
     write_json(
         tmp_path / "report" / "metrics.json",
         {"metrics": [{"key": key, "value": value, "unit": "mm", "better": "lower"} for key, value in values.items()]},
     )
-    monkeypatch.setattr(pipeline, "run_report", lambda work, **_: work / "report" / "index.html")
+    monkeypatch.setattr(pipeline, "report", lambda work, **_: StageResult(work / "report" / "index.html", ""))
     options = [word for limit in limits for word in ("--fail-above", limit)]
     assert run("report", tmp_path, *options) == code
-    assert capsys.readouterr().err.count("\n") == code
+    assert capsys.readouterr().err.count("\n") == bool(code)

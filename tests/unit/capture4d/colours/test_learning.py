@@ -10,15 +10,17 @@ import cv2
 import numpy as np
 import pytest
 
-from capture4d.captures.capture import read_capture, scan_path
+from capture4d.captures.capture import read_capture, read_scan, scan_path
 from capture4d.captures.garment_scans import load_garment_scan
+from capture4d.captures.take_colours import take_colours
 from capture4d.colours.learning import ColoursNotSeparableError, fit_light, learn_colours
 from capture4d.colours.spaces import encode_colours, linear_colours
 from capture4d.extraction.garment import extract_garment
-from capture4d.extraction.stage import run
+from capture4d.extraction.stage import ExtractionSettings, run
 from capture4d.files.meshes import read_coloured_mesh
 from capture4d.geometry.mesh import vertex_normals
-from capture4d.tracking.config import TrackingConfig
+from capture4d.tracking.config import SamplingConfig
+from capture4d.tracking.scan_points import ScanPoints, scan_points
 from capture4d.types import Mesh, Scan
 
 AROUND, ALONG = 140, 160
@@ -157,11 +159,15 @@ def without_colours(capture: Path) -> None:
     (capture / "capture.json").write_text(json.dumps(description))
 
 
+def extract(capture: Path, output: Path, *, learn_colours: bool = False) -> None:
+    run(read_capture(capture), output, ExtractionSettings(learn_colours=learn_colours))
+
+
 def test_a_capture_without_colours_is_extracted_all_the_same(tube_capture: Path, tmp_path: Path) -> None:
-    run(tube_capture, tmp_path / "given")
-    run(tube_capture, tmp_path / "learned", learn_colours=True)
+    extract(tube_capture, tmp_path / "given")
+    extract(tube_capture, tmp_path / "learned", learn_colours=True)
     without_colours(tube_capture)
-    run(tube_capture, tmp_path / "blind")
+    extract(tube_capture, tmp_path / "blind")
     for frame_id in read_capture(tube_capture).frame_ids:
         given, *others = (
             load_garment_scan(tmp_path / name / "frames" / f"{frame_id:06d}.npz", frame_id)
@@ -179,7 +185,7 @@ def test_a_capture_without_colours_is_extracted_all_the_same(tube_capture: Path,
 @pytest.mark.parametrize("blind", [False, True])
 def test_textured_scans_are_extracted_as_coloured_ones_are(tube_capture: Path, tmp_path: Path, blind: bool) -> None:
     """The same tubes with a picture of their paint, 64 by 512 pixels, instead of colours at the vertices."""
-    run(tube_capture, tmp_path / "coloured")
+    extract(tube_capture, tmp_path / "coloured")
     capture = read_capture(tube_capture)
     for frame_id in capture.frame_ids:
         path = scan_path(capture, frame_id)
@@ -187,7 +193,7 @@ def test_textured_scans_are_extracted_as_coloured_ones_are(tube_capture: Path, t
         path.unlink()
     if blind:
         without_colours(tube_capture)
-    run(tube_capture, tmp_path / "textured")
+    extract(tube_capture, tmp_path / "textured")
     for frame_id in capture.frame_ids:
         coloured, textured = (
             load_garment_scan(tmp_path / name / "frames" / f"{frame_id:06d}.npz", frame_id)
@@ -214,11 +220,14 @@ def write_textured(path: Path, mesh: Mesh) -> None:
 
 
 def test_tracking_sees_the_same_cloth_without_colours(tube_capture: Path) -> None:
-    from capture4d.tracking.stage import _points
+    def points() -> ScanPoints:
+        capture = read_capture(tube_capture)
+        colours = take_colours(capture)
+        paints = tuple(dict.fromkeys(colours.boundary.values()))
+        return scan_points(colours.flat(read_scan(capture, 6)), colours.garment, paints, SamplingConfig(), source="6")
 
-    given, _ = _points(read_capture(tube_capture), 6, TrackingConfig())
+    given = points()
     without_colours(tube_capture)
-    blind, trouble = _points(read_capture(tube_capture), 6, TrackingConfig())
-    assert not trouble
+    blind = points()
     np.testing.assert_array_equal(blind.points, given.points)
     np.testing.assert_array_equal(blind.cloth, given.cloth)

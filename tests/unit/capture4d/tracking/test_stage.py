@@ -15,7 +15,7 @@ from capture4d.body.anny import load_anny
 from capture4d.body.motion_retarget import pose_sequence
 from capture4d.body.posed_surface import BodyState
 from capture4d.body.skinning import pose_frame, with_shape
-from capture4d.captures.capture import Capture, write_capture_description, write_scan
+from capture4d.captures.capture import Capture, read_capture, write_capture_description, write_scan
 from capture4d.captures.work_folder import load_tracking, tracking_digest
 from capture4d.errors import InputError
 from capture4d.files.atomic import read_json
@@ -70,7 +70,7 @@ def test_a_take_is_tracked_and_a_run_that_was_cut_short_ends_the_same(tmp_path: 
     truth = dressed_capture(tmp_path / "capture", 4)
     save_poses(tmp_path / "start.npz", truth)
     config = TrackingConfig(start=str(tmp_path / "start.npz"))
-    digest = run(tmp_path / "capture", tmp_path / "work" / "body", config).digest
+    digest = run(read_capture(tmp_path / "capture"), tmp_path / "work" / "body", config).digest
     body, found = load_tracking(tmp_path / "work" / "body")
     assert found.frame_ids.tolist() == [5, 6, 7, 8]
     here, there = with_shape(body, found.shape), with_shape(body, truth.shape)
@@ -82,8 +82,8 @@ def test_a_take_is_tracked_and_a_run_that_was_cut_short_ends_the_same(tmp_path: 
 
     (tmp_path / "work" / "body" / "frames" / "000008.npz").unlink()
     (tmp_path / "work" / "body" / "refined" / "000006.npz").unlink()
-    assert run(tmp_path / "capture", tmp_path / "work" / "body", config).digest == digest
-    assert tracking_digest(tmp_path / "work" / "body", tmp_path / "capture") == digest
+    assert run(read_capture(tmp_path / "capture"), tmp_path / "work" / "body", config).digest == digest
+    assert tracking_digest(tmp_path / "work" / "body", read_capture(tmp_path / "capture")) == digest
 
 
 @pytest.mark.slow
@@ -94,7 +94,7 @@ def test_a_frame_says_which_limbs_nobody_scanned_and_what_is_wrong_with_its_scan
     for frame in ("000005", "000009"):
         path = tmp_path / "capture" / "scans" / f"{frame}.ply"
         path.write_bytes(path.read_bytes()[:5000])
-    run(tmp_path / "capture", tmp_path / "body", TrackingConfig(start=str(tmp_path / "start.npz")))
+    run(read_capture(tmp_path / "capture"), tmp_path / "body", TrackingConfig(start=str(tmp_path / "start.npz")))
     records = [json.loads(line) for line in (tmp_path / "body" / "metrics.jsonl").read_text().splitlines()]
     assert [record["verdict"] for record in records] == ["lost", "good", "check", "good", "lost"]
     assert [record["unseen"] for record in records[1:4]] == [[], ["right forearm", "right hand"], []]
@@ -133,14 +133,14 @@ def test_nothing_but_damaged_scans_is_an_error_again_and_again(tmp_path: Path) -
         path.write_bytes(b"ply")
     for _ in range(2):
         with pytest.raises(InputError, match=r"000005\.ply: "):
-            run(tmp_path / "capture", tmp_path / "work" / "body", TrackingConfig(start="rest"))
+            run(read_capture(tmp_path / "capture"), tmp_path / "work" / "body", TrackingConfig(start="rest"))
     with pytest.raises(InputError, match="'track' is not finished"):
-        tracking_digest(tmp_path / "work" / "body", tmp_path / "capture")
+        tracking_digest(tmp_path / "work" / "body", read_capture(tmp_path / "capture"))
 
 
 def test_a_start_that_is_no_file_and_a_stage_that_was_not_run(tmp_path: Path) -> None:
     dressed_capture(tmp_path / "capture", 1)
     with pytest.raises(InputError, match="expected search, rest or a motion file, found 'nowhere'"):
-        run(tmp_path / "capture", tmp_path / "work" / "body", TrackingConfig(start="nowhere"))
+        run(read_capture(tmp_path / "capture"), tmp_path / "work" / "body", TrackingConfig(start="nowhere"))
     with pytest.raises(InputError, match="run: capture4d track"):
-        tracking_digest(tmp_path / "work" / "body", tmp_path / "capture")
+        tracking_digest(tmp_path / "work" / "body", read_capture(tmp_path / "capture"))

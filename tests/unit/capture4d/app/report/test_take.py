@@ -2,6 +2,7 @@ import json
 import re
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,13 +12,14 @@ from capture4d.app.drawing.panels import Panel, data_uri, write_panel
 from capture4d.app.report.metrics import summarise
 from capture4d.app.report.take import ReportConfig, run
 from capture4d.body.anny import load_anny
-from capture4d.captures.capture import Capture, write_capture_description, write_scan
+from capture4d.captures.capture import Capture, read_capture, write_capture_description, write_scan
 from capture4d.captures.truth import TruthFrame, TruthModel, write_truth_frame, write_truth_model
+from capture4d.captures.work_folder import open_work
 from capture4d.errors import InputError
 from capture4d.files.atomic import write_bytes, write_json, write_npy, write_npz
 from capture4d.files.records import save_body, save_garment, save_poses
 from capture4d.geometry.mesh import boundary_loops
-from capture4d.runs.stage import open_stage
+from capture4d.runs.stage import StageResult, open_stage
 from capture4d.types import Garment, Mesh, PoseSequence, Scan
 
 FRAMES = 8
@@ -74,13 +76,17 @@ def work(tmp_path):
     return tmp_path
 
 
+def draw(work: Path, config: ReportConfig | None = None, *, capture: Path | None = None) -> StageResult:
+    return run(open_work(work), config or ReportConfig(), capture=None if capture is None else read_capture(capture))
+
+
 def metrics_of(work):
     metrics = json.loads((work / "report" / "metrics.json").read_text())["metrics"]
     return {entry["key"]: entry["value"] for entry in metrics}
 
 
 def test_metrics_follow_their_definitions(work):
-    run(work, config=ReportConfig(pictures=1))
+    draw(work, config=ReportConfig(pictures=1))
     metrics = metrics_of(work)
     assert metrics["correspondence_mean_mm"] == pytest.approx(np.mean(1 + np.arange(FRAMES)), rel=1e-4)
     assert metrics["drift_mm_per_frame"] == pytest.approx(1, rel=1e-4)
@@ -95,7 +101,7 @@ def test_metrics_follow_their_definitions(work):
 
 
 def test_the_page_stands_alone_and_shows_what_it_should(work):
-    page = run(work).read_text()
+    page = draw(work).path.read_text()
     assert not re.search(r'(src|href)="(?!data:)', page)
     assert page.count("data:image/webp") >= 6 * 2 * 4
     assert "a &lt;reason&gt; to escape" in page
@@ -107,7 +113,7 @@ def test_the_page_stands_alone_and_shows_what_it_should(work):
 
 def test_a_comparison_is_shown_and_makes_the_report_anew(work):
     config = ReportConfig(pictures=1, truth_frames=1)
-    assert "Surfaces compared" not in run(work, config=config).read_text()
+    assert "Surfaces compared" not in draw(work, config=config).path.read_text()
     stage = open_stage(work / "compare", name="compare", schema=1, config=None, upstream={})
     write_panel(stage.path / "pictures" / "a.webp", Panel("map of the scan", data_uri(np.zeros((8, 8, 3), np.uint8))))
     row = {"name": "network", "vertex_mm": None, "normal_deg": 7.25, "wrinkle_energy_kept": 0.5, "flicker_deg": 1,
@@ -117,9 +123,9 @@ def test_a_comparison_is_shown_and_makes_the_report_anew(work):
         stage.path / "compare.json",
         {"frames": [6, 7], "against_truth": False, "methods": [row], "pictures": [picture], "people": picture},
     )
-    assert "Surfaces compared" not in run(work, config=config).read_text(), "the comparison is not finished"
+    assert "Surfaces compared" not in draw(work, config=config).path.read_text(), "the comparison is not finished"
     stage.finish([stage.path / "compare.json"])
-    page = run(work, config=config).read_text()
+    page = draw(work, config=config).path.read_text()
     assert "On 2 held-out frames" in page
     assert 'alt="map of the scan, frame 7"' in page
     assert "Frame 7, from its pose, on five people" in page
@@ -127,36 +133,36 @@ def test_a_comparison_is_shown_and_makes_the_report_anew(work):
 
 
 def test_a_report_is_made_once(work):
-    run(work, config=ReportConfig(pictures=1))
+    draw(work, config=ReportConfig(pictures=1))
     before = (work / "report" / "index.html").stat().st_mtime_ns
-    run(work, config=ReportConfig(pictures=1))
+    draw(work, config=ReportConfig(pictures=1))
     assert (work / "report" / "index.html").stat().st_mtime_ns == before
-    run(work, config=ReportConfig(pictures=2))
+    draw(work, config=ReportConfig(pictures=2))
     assert (work / "report" / "index.html").stat().st_mtime_ns != before
 
 
 def test_truth_on_every_nth_frame_keeps_the_slope(work):
-    run(work, config=ReportConfig(pictures=1, truth_frames=3))
+    draw(work, config=ReportConfig(pictures=1, truth_frames=3))
     assert metrics_of(work)["drift_mm_per_frame"] == pytest.approx(1, rel=0.1)
 
 
 def test_a_capture_that_has_moved_is_named(work):
     (work / "capture").rename(work / "elsewhere")
     with pytest.raises(InputError, match="capture"):
-        run(work)
-    run(work, capture=work / "elsewhere", config=ReportConfig(pictures=1, truth_frames=1))
+        draw(work)
+    draw(work, capture=work / "elsewhere", config=ReportConfig(pictures=1, truth_frames=1))
 
 
 def test_an_unfinished_registration_names_the_repair(tmp_path, work):
     stage = json.loads((work / "registration" / "stage.json").read_text())
     write_json(work / "registration" / "stage.json", {**stage, "status": "running"})
     with pytest.raises(InputError, match="capture4d register"):
-        run(work)
+        draw(work)
 
 
 def test_a_take_without_truth_has_no_truth_metrics(work):
     (work / "capture" / "truth" / "model.npz").unlink()
-    run(work, config=ReportConfig(pictures=1))
+    draw(work, config=ReportConfig(pictures=1))
     metrics = metrics_of(work)
     assert "correspondence_mean_mm" not in metrics
     assert "fit_mean_mm" in metrics
@@ -203,7 +209,7 @@ def test_tracking_is_shown_beside_the_truth(work):
                       "median_m": 0.0008, "inside": 0.0, "started_from": "motion", "cpu_s": 0.2})  # fmt: skip
     lines[3] |= {"verdict": "lost", "reasons": ["skin & suit are gone"], "median_m": None}
     write_bytes(work / "body" / "metrics.jsonl", "\n".join(json.dumps(line) for line in lines).encode())
-    page = run(work, config=ReportConfig(pictures=1, stage_pictures=2)).read_text()
+    page = draw(work, config=ReportConfig(pictures=1, stage_pictures=2)).path.read_text()
     metrics = metrics_of(work)
     assert metrics["joint_mean_mm"] == pytest.approx(2.0, rel=1e-4)
     assert metrics["track_good_percent"] == pytest.approx(87.5)
@@ -215,7 +221,7 @@ def test_tracking_is_shown_beside_the_truth(work):
 
 
 def test_a_report_without_tracking_and_rig_shows_neither(work):
-    page = run(work, config=ReportConfig(pictures=1, stage_pictures=1)).read_text()
+    page = draw(work, config=ReportConfig(pictures=1, stage_pictures=1)).path.read_text()
     assert "<h2>Tracking</h2>" not in page
     assert "<h2>Rig</h2>" not in page
     assert "<h2>Extraction</h2>" in page
@@ -229,7 +235,7 @@ def test_a_calibrated_rig_is_shown_with_its_uncertainty(work):
         "volume": [{"name": "000", "corner_rms_mm": 0.3}],
     }  # fmt: skip
     write_json(work / "capture" / "calibration.json", report)
-    page = run(work, config=ReportConfig(pictures=1, stage_pictures=1)).read_text()
+    page = draw(work, config=ReportConfig(pictures=1, stage_pictures=1)).path.read_text()
     assert "<h2>Rig</h2>" in page
     assert "1,234 corners" in page
     assert "0.123" in page
