@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from dataclasses import field, replace
+from typing import Annotated, Literal
 
+from capture4d.settings import Count, NonNegative, Number, Positive, Range, Seed, Share, Whole, settings
 from data_synth.outfits import OutfitName
 from data_synth.scanner.config import FusionConfig, RigConfig, ScannerConfig, StereoConfig
 
@@ -12,8 +13,11 @@ ClipName = Literal[
     "range-of-motion", "twist", "reach", "side-bend", "walk", "hop", "arm-circles", "reach-twist", "sampled"
 ]
 
+Vertices = Annotated[int, Range(least=100)]  # fewer are too few to sew a shirt from
+Shrink = Annotated[float, Range(above=0, most=1)]
 
-@dataclass(frozen=True)
+
+@settings
 class MotionConfig:
     """What the subject does."""
 
@@ -21,45 +25,45 @@ class MotionConfig:
     """A scripted clip, or random poses within joint limits (sampled)."""
     bvh: str | None = None
     """A BVH file to follow instead of a clip."""
-    skip_frames: int = 0
+    skip_frames: Whole = 0
     """Frames to leave out at the start of the motion, 60 a second."""
-    seed: int = 0
+    seed: Seed = 0
     """Varies the motion of the same subject in the same garment."""
     reverse: bool = False
     """Backwards in time."""
 
 
-@dataclass(frozen=True)
+@settings
 class GarmentStyle:
     """A T-shirt, relative to the person it is drafted for."""
 
-    size: float = 1.0
+    size: Positive = 1.0
     """Scale of the draft's widths; 1 fits the person before ease."""
-    ease: float = 0.22
+    ease: Annotated[float, Range(above=-1)] = 0.22
     """Girth beyond the chest's, as a fraction of it; below 0.12 a shirt is nearly free of folds."""
-    sleeve_length: float = 0.62
+    sleeve_length: Positive = 0.62
     """Underarm length of the sleeve, as a fraction of the upper arm."""
-    hem_drop_m: float = 0.12
+    hem_drop_m: Number = 0.12
     """How far below the hip joint the hem lies, metres."""
 
 
-@dataclass(frozen=True)
+@settings
 class Fabric:
     """What the cloth is made of."""
 
     name: str = "jersey"
-    density: float = 0.2
+    density: Positive = 0.2
     """Mass of an area, kg/m2."""
-    stretch_stiffness: float = 200.0
+    stretch_stiffness: Positive = 200.0
     """Membrane stiffness of the coarse sheet, N/m. Its own weight stretches a shirt by half a percent at 200; at 1000
     the solver is so far from converged that the hem hangs 26 mm too low."""
-    coarse_bending: float = 5e-4
+    coarse_bending: NonNegative = 5e-4
     """Bending stiffness of the coarse sheet, N m."""
-    friction: float = 0.05
+    friction: NonNegative = 0.05
     """Coulomb coefficient between cloth and body."""
-    shrink: tuple[float, float] = (0.93, 0.98)
+    shrink: tuple[Shrink, Shrink] = (0.93, 0.98)
     """Size of the coarse rest pattern across and along the grain; the rest becomes fine folds."""
-    fold_bending: float = 0.17
+    fold_bending: Share = 0.17
     """Bending gain of the wrinkle mesh, 0 to 1: more makes wider folds."""
 
 
@@ -74,94 +78,94 @@ FABRICS = {
 }
 
 
-@dataclass(frozen=True)
+@settings
 class SimulationConfig:
     """The coarse simulation."""
 
-    vertices: int = 5000
+    vertices: Vertices = 5000
     """Vertices of the simulated sheet."""
-    fps: float = 60.0
-    substeps: int = 48
+    fps: Positive = 60.0
+    substeps: Count = 48
     """Steps a frame. Many short ones converge far better than many iterations: the hem of 48 x 1 hangs as high as that
     of 32 x 2, at three quarters of the cost, and that of 24 x 2 higher than that of 16 x 3."""
-    iterations: int = 1
+    iterations: Count = 1
     """Vertex block descent sweeps a substep."""
-    calm_frames: int = 18
+    calm_frames: Count = 18
     """Frames in the dressing pose in which the panels close on the body."""
-    approach_frames: int = 24
+    approach_frames: Count = 24
     """Frames from the dressing pose to the clip's first pose."""
-    rest_frames: int = 12
+    rest_frames: Whole = 12
     """Frames at rest before the clip starts."""
-    contact_gap_m: float = 0.008
-    contact_substeps: int = 3
+    contact_gap_m: NonNegative = 0.008
+    contact_substeps: Count = 3
     """Substeps from one search for contacts to the next."""
-    damping: float = 0.99
+    damping: Share = 0.99
     """Share of the velocity kept each substep."""
-    calm_damping: float = 0.85
-    hold_hz: float = 20.0
+    calm_damping: Share = 0.85
+    hold_hz: NonNegative = 20.0
     """Frequency at which a vertex at the shoulders would swing about its place on the body: how firmly the shirt keeps
     its seat. 0 leaves the sheet free, and its folds at the shoulders to its history."""
-    hold_depth_m: float = 0.09
+    hold_depth_m: Positive = 0.09
     """How far below the shoulders the hold has fallen to a third of the way to `hold_floor`."""
-    hold_floor: float = 0.07
+    hold_floor: Share = 0.07
     """Share of the hold far below the shoulders."""
-    hold_ripple_m: float = 0.007
+    hold_ripple_m: NonNegative = 0.007
     """Standard deviation of the fixed bumps of that place, metres. They say which way the cloth buckles when the arms
     go up; without them a tenth of a millimetre decides, and two runs that had met part again."""
-    hold_ripple_width_m: tuple[float, float] = (0.012, 0.02)
+    hold_ripple_width_m: tuple[NonNegative, NonNegative] = (0.012, 0.02)
     """Width of the bumps across and along the grain."""
 
 
-@dataclass(frozen=True)
+@settings
 class RelaxationConfig:
     """The fine folds."""
 
-    vertices: int = 80_000
+    vertices: Vertices = 80_000
     """Vertices of the wrinkle mesh."""
-    sweeps: int = 20
+    sweeps: Whole = 20
     """Gauss-Seidel sweeps a frame. Fewer let the folds lag behind the pose a little, which calms them: while arms rise,
     flicker is 1.40 with 20 sweeps and 1.44 with 30."""
-    start_sweeps_factor: int = 12
+    start_sweeps_factor: Count = 12
     """How many times more where there is no frame before."""
-    pull_normal: float = 0.001
+    pull_normal: Share = 0.001
     """Pull towards the coarse sheet along its normal, per sweep."""
-    pull_tangential: float = 0.0005
+    pull_tangential: Share = 0.0005
     """The same in the sheet's plane."""
-    radius_m: float = 0.012
+    radius_m: NonNegative = 0.012
     """No vertex leaves the coarse sheet farther than this."""
-    body_margin_m: float = 0.003
+    body_margin_m: NonNegative = 0.003
     """Clearance to the body."""
-    warm_start: float = 0.945
+    warm_start: Share = 0.945
     """Share of the folds carried over from the frame before; the rest is the imperfection. 1 moves most smoothly, but
     then the folds are an accident of the start; below 0.5 they shimmer."""
-    imperfection_m: float = 0.003
+    imperfection_m: NonNegative = 0.003
     """Standard deviation of the imperfection, metres. Larger makes the folds follow the pose, not the history: with
     1 mm two runs that meet differ by 0.45 of the residual at warm start 0.85, with 2 mm by 0.32."""
-    imperfection_width_m: tuple[float, float] = (0.0085, 0.045)
+    imperfection_width_m: tuple[NonNegative, NonNegative] = (0.0085, 0.045)
     """Width of the imperfection across and along the grain; white noise would fold the cloth into crepe."""
 
 
-@dataclass(frozen=True)
+@settings
 class SynthConfig:
     """One synthetic take: who, what, how it moves, how it is scanned."""
 
     name: str = "tshirt"
-    seed: int = 0
+    seed: Seed = 0
     """Everything random follows from it; equal seeds give equal files."""
-    frames: int = 120
+    frames: Count = 120
     """Frames of the capture."""
-    capture_every: int = 1
+    capture_every: Count = 1
     """Simulated frames (60 a second) per captured frame."""
-    body_shape: tuple[float, ...] = ()
+    body_shape: tuple[Number, ...] = ()
     """Shape coefficients of the subject, in standard deviations: the first is height, the second girth."""
-    drafted_for: tuple[float, ...] | None = None
+    drafted_for: tuple[Number, ...] | None = None
     """Shape of the person for whom the garment was drafted and meshed, if it is somebody else: the same garment, vertex
     for vertex, graded to the subject."""
     scans: bool = True
     """Off: the cloth and its truth alone."""
-    mocap_noise_deg: float = 0.3
+    mocap_noise_deg: NonNegative = 0.3
     """Error of the joint angles in the capture's poses.npz, standard deviation; truth/ holds the exact ones."""
-    template_vertices: int = 5000
+    template_vertices: Vertices = 5000
     """Vertices of the registration template."""
     fabric: Literal["jersey", "shirt-cotton", "linen"] = "jersey"
     style: GarmentStyle = field(default_factory=GarmentStyle)
@@ -213,7 +217,7 @@ PRESETS: dict[str, SynthConfig] = {
 """Takes by name, from minutes to an hour."""
 
 
-@dataclass(frozen=True)
+@settings
 class TrainingSetConfig:
     """Takes to learn a garment from: one subject, one garment, one template, many clips."""
 
@@ -224,7 +228,7 @@ class TrainingSetConfig:
     """Clips that are not learned from."""
     reversed: tuple[str, ...]
     """Clips that run backwards, not learned from either."""
-    bodies: dict[str, tuple[float, ...]]
+    bodies: dict[str, tuple[Number, ...]]
     """Other people, by shape coefficients. The held-out clips are simulated on each, without scans, in the same garment
     graded to them."""
 
@@ -307,11 +311,11 @@ TRAINING_SETS: dict[str, TrainingSetConfig] = {
 `python -m benchmarks synthesis` prints is about 13,000 CPU seconds; `tiny-train` is its small likeness."""
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class BoardConfig:
     """A board and how it is waved about."""
 
     board: str = "charuco:8x6:100:74:DICT_4X4_50"
     """charuco:COLUMNSxROWS:SQUARE_MM:MARKER_MM:DICTIONARY."""
-    poses: int = 24
-    seed: int = 0
+    poses: Count = 24
+    seed: Seed = 0

@@ -33,7 +33,6 @@ from data_synth.scanner.border_paint import PaintedSheet, paint_borders
 from data_synth.scanner.config import ScanConfig
 from data_synth.scanner.rig import bounding_sphere, scanner_rig
 from data_synth.scanner.scan import LABEL_GARMENT, Surface, scan_surfaces
-from data_synth.setting_checks import check_scan
 
 __all__ = ["run"]
 
@@ -63,10 +62,8 @@ def run(
         output: capture folder.
         template: mesh to register later. It lies on the first mesh, or is the same mesh in another pose.
     Raises:
-        InputError: there are no meshes, or one is damaged, or the template has nothing to do with them; or a setting is
-            out of range.
+        InputError: there are no meshes, or one is damaged, or the template has nothing to do with them.
     """
-    check_scan(config)
     colours = [parse_colour(text) for text in config.border_colours]
     garment_colour = parse_colour(config.garment_colour)
     for cached in (_sequence, _first, _painted):  # files may have changed since an earlier run in this process

@@ -24,7 +24,6 @@ from data_synth.config import SynthConfig
 from data_synth.outfits import OUTFITS
 from data_synth.scan_files import pending_scans
 from data_synth.scanner.scan import scan_surfaces
-from data_synth.setting_checks import check_synth
 from data_synth.take import Take, measured_poses, prepare_take, simulate_take, take_rig, take_surfaces
 
 __all__ = [
@@ -60,7 +59,7 @@ def run(output: Path, config: SynthConfig, *, workers: int = 2, overwrite: bool 
     finished take has lost are made anew, for which the clip is simulated again.
 
     Raises:
-        InputError: a setting is out of range, or the folder holds something else.
+        InputError: the folder holds something else.
     """
     stage = open_take(output, config, overwrite=overwrite)
     for _ in run_jobs(
@@ -81,9 +80,8 @@ def open_take(output: Path, config: SynthConfig, *, overwrite: bool = False) -> 
     """The folder of a take, new or to be continued.
 
     Raises:
-        InputError: a setting is out of range, or the folder holds something else or a take with other settings.
+        InputError: the folder holds something else or a take with other settings.
     """
-    check_synth(config)
     upstream = {}
     if config.motion.bvh is not None:
         path = Path(config.motion.bvh)

@@ -18,7 +18,6 @@ from capture4d.files.atomic import write_bytes, write_json
 from capture4d.runs.stage import Stage, StageResult, open_stage
 from capture4d.runs.workers import run_jobs
 from data_synth.config import SynthConfig, TrainingSetConfig
-from data_synth.setting_checks import check_synth
 from data_synth.stage import (
     finish_take,
     is_whole,
@@ -39,10 +38,8 @@ def run(output: Path, config: TrainingSetConfig, *, workers: int = 2, overwrite:
     """Make what is missing of a training set.
 
     Raises:
-        InputError: a setting of a take is out of range, or the folder holds something else.
+        InputError: the folder holds something else.
     """
-    for take in config.takes.values():
-        check_synth(take)
     stage = open_stage(output, name="training-set", schema=SCHEMA, config=config, upstream={}, overwrite=overwrite)
     wanted = {f"takes/{name}": take for name, take in config.takes.items()}
     wanted |= {

@@ -14,8 +14,10 @@ the scan get finer; the paper gives its weights without units and says "triangle
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import field
+from typing import Annotated, Literal
+
+from capture4d.settings import Cosine, Count, Degrees, NonNegative, Percent, Positive, Range, Share, Whole, settings
 
 __all__ = [
     "PAPER",
@@ -37,49 +39,49 @@ __all__ = [
 BoundaryRule = Literal["argmax", "nearest", "mean", "none"]
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class GraphConfig:
     """The deformation graph, sampled on the template once."""
 
-    nodes: int = 300
+    nodes: Count = 300
     """Number of affine nodes, spread along the surface."""
-    nodes_per_vertex: int = 6
+    nodes_per_vertex: Count = 6
     """How many nodes move one vertex."""
-    vertices: int = 1000
+    vertices: Whole = 1000
     """Template vertices that carry the data term of the coarse stage, besides all border vertices; 0 for all."""
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class LinearSolverConfig:
     """Block-Jacobi preconditioned conjugate gradients inside each Gauss-Newton step."""
 
-    tolerance: float = 1e-2
+    tolerance: Annotated[float, Range(above=0, below=1)] = 1e-2
     """Relative residual at which to stop; tighter changes nothing but the time."""
-    max_iterations: int = 120
+    max_iterations: Count = 120
     """Iterations at most."""
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class DataConfig:
     """Which scan points a template vertex may be pulled to."""
 
     rule: Literal["plane", "both_ways"] = "plane"
     """plane: each vertex to the plane at its nearest scan point; both_ways: the scan's points vote as well."""
-    max_voters: int = 20000
+    max_voters: Count = 20000
     """Scan points that vote under both_ways."""
-    normal_length: float = 0.002
+    normal_length: NonNegative = 0.002
     """What a normal turned by 60 degrees counts as among distances under both_ways, metres."""
-    min_normal_cosine: float = 0.4
+    min_normal_cosine: Cosine = 0.4
     """Reject a match whose normals differ by more than this angle's cosine."""
-    robust_scale: float = 0.4
+    robust_scale: Positive = 0.4
     """Scale of the Geman-McClure weight, as a share of the distance gate."""
-    point_share: float = 0.0
+    point_share: Share = 0.0
     """Weight of the tangential part of the match: 0 is point-to-plane, 1 is point-to-point."""
-    smoothing_passes: int = 1
+    smoothing_passes: Whole = 1
     """Laplacian passes over the scan before its normals are taken."""
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class BoundaryConfig:
     """Painted borders: DeepWrinkles Eq. 2 and its variants."""
 
@@ -89,33 +91,33 @@ class BoundaryConfig:
     """The same in the dense stage."""
     along_curve: bool = True
     """Drop the residual along the border, so that border vertices are not slid along the curve (dense stage)."""
-    gate: float = 0.12
+    gate: Positive = 0.12
     """Farthest target, metres."""
-    max_points: int = 3000
+    max_points: Count = 3000
     """Scan border points are thinned to this many."""
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class Schedule:
     """A run of Gauss-Newton steps whose weights and gates move geometrically from first to last."""
 
-    steps: int
+    steps: Whole
     """Gauss-Newton steps; correspondences are renewed before each."""
-    gate: tuple[float, float]
+    gate: tuple[Positive, Positive]
     """Distance gate of the data term, metres, first and last step."""
-    rigid: tuple[float, float] = (0.0, 0.0)
+    rigid: tuple[NonNegative, NonNegative] = (0.0, 0.0)
     """Weight of E_rigid, first and last step."""
-    smooth: tuple[float, float] = (0.0, 0.0)
+    smooth: tuple[NonNegative, NonNegative] = (0.0, 0.0)
     """Weight of E_smooth (coarse) or of the displacement's bending (dense)."""
-    stretch: tuple[float, float] = (0.0, 0.0)
+    stretch: tuple[NonNegative, NonNegative] = (0.0, 0.0)
     """Weight of lengths against the template's: between nodes (coarse), along edges (dense)."""
-    anchor: tuple[float, float] = (0.0, 0.0)
+    anchor: tuple[NonNegative, NonNegative] = (0.0, 0.0)
     """Weight of the tangential distance to the start (dense stage)."""
-    boundary: tuple[float, float] = (2.0, 2.0)
+    boundary: tuple[NonNegative, NonNegative] = (2.0, 2.0)
     """Weight of E_bound."""
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class CoarseConfig:
     """The deformation graph stage."""
 
@@ -126,13 +128,13 @@ class CoarseConfig:
     start_lengths: bool = True
     """In the warm schedule, hold nodes to their distances in the start, not in the template: folds have shortened
     them, and where cloth bunches the template's distances push it off its place."""
-    compression: float = 0.3
+    compression: NonNegative = 0.3
     """Share of the stretch weight that resists shortening, in the warm schedule."""
-    cold_compression: float = 1.0
+    cold_compression: NonNegative = 1.0
     """The same in the cold schedule, where nodes are held to the template's distances."""
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class DenseConfig:
     """The per-vertex stage."""
 
@@ -140,58 +142,58 @@ class DenseConfig:
     """After a cold coarse stage."""
     warm: Schedule = Schedule(3, (0.02, 0.012), smooth=(0.06, 0.05), stretch=(10.0, 0.05), boundary=(0.2, 0.1))
     """After a warm coarse stage."""
-    plasticity: float = 0.5
+    plasticity: Share = 0.5
     """Share of the bending that is forgiven between steps: 0 keeps the coarse stage's shape, 1 only damps change."""
-    compression: float = 1.0
+    compression: NonNegative = 1.0
     """Share of the stretch weight that resists shortening: folds finer than the template's edges shorten them."""
     fold_lengths: bool = True
     """In the warm schedule, hold edges to the length that the folds in the scan leave them, instead of their length on
     the pattern. From a distant start the folds seen around an edge are not yet its own."""
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class SequenceConfig:
     """How a take is cut up and where each frame starts."""
 
-    segment: int = 240
+    segment: Count = 240
     """Fewest frames between keyframes. Segments start from keyframes and run in parallel; shorter ones are faster on
     many cores, and forget more often how the cloth has slid."""
-    keyframe_bend_deg: float = 8.0
+    keyframe_bend_deg: Degrees = 8.0
     """A keyframe's joints are at most this far from the rest pose, root mean square, degrees; 0 makes one segment."""
     start: Literal["best", "previous", "skinned"] = "best"
     """Start of a frame: the frame before, as it lies and moved with the body; the skinned pose; or a blend of them by
     how near each is to the scan."""
-    relax: float = 0.4
+    relax: NonNegative = 0.4
     """Trust in the skinned pose within the blend, beside 1 in the frame before: pulls cloth back that has drifted."""
-    cold_above: float = 0.004
+    cold_above: NonNegative = 0.004
     """Take the cold schedule when the median distance from start to scan exceeds this, metres."""
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class QualityConfig:
     """When a frame is good, to be checked, or failed."""
 
-    fit_check_mm: float = 1.0
+    fit_check_mm: NonNegative = 1.0
     """Mean distance to the scan above which a frame is to be checked."""
-    fit_fail_mm: float = 5.0
+    fit_fail_mm: NonNegative = 5.0
     """Mean distance to the scan above which a frame has failed."""
-    boundary_check_mm: float = 3.0
+    boundary_check_mm: NonNegative = 3.0
     """Mean border error above which a frame is to be checked."""
-    boundary_fail_mm: float = 15.0
+    boundary_fail_mm: NonNegative = 15.0
     """Mean border error above which a frame has failed."""
-    stretch_check: float = 1.4
+    stretch_check: NonNegative = 1.4
     """99th percentile of edge stretch above which a frame is to be checked."""
-    stretch_fail: float = 2.5
+    stretch_fail: NonNegative = 2.5
     """99th percentile of edge stretch above which a frame has failed."""
-    flipped_check_percent: float = 1.0
+    flipped_check_percent: Percent = 1.0
     """Share of faces against the scan's normals above which a frame is to be checked."""
-    intersections_check_percent: float = 10.0
+    intersections_check_percent: Percent = 10.0
     """Share of faces that cut another face above which a frame is to be checked."""
-    min_covered_percent: float = 40.0
+    min_covered_percent: Percent = 40.0
     """Share of vertices with scan data below which a frame has failed."""
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class RegistrationConfig:
     """Everything the registration stage reads."""
 
@@ -244,7 +246,7 @@ SOFT = RegistrationConfig(
 )
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class MeshRegistrationConfig:
     """Any template onto any scan."""
 

@@ -2,34 +2,46 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import field
+from typing import Annotated, Literal
 
-from capture4d.errors import InputError
+from capture4d.settings import (
+    Count,
+    NonNegative,
+    NotEmpty,
+    Part,
+    Positive,
+    Range,
+    Seed,
+    SettingError,
+    Share,
+    Whole,
+    settings,
+)
 
 
-@dataclass(frozen=True)
+@settings
 class ShapeConfig:
     """The statistical model: mean and principal directions of the unposed garment."""
 
-    components: int = 0
+    components: Whole = 0
     """How many directions to keep; 0: the fewest with which no vertex of a training frame is off by more than
     `max_error_mm`."""
-    max_error_mm: float = 5.0
+    max_error_mm: NonNegative = 5.0
     """Worst vertex of the worst training frame, in the pose (the paper's 5 mm at 500 directions)."""
-    most_components: int = 500
+    most_components: Count = 500
     """No more than so many, whatever the error."""
     method: Literal["auto", "exact", "randomised"] = "auto"
     """How directions are found; `auto` is exact up to `memory_mb`."""
-    memory_mb: float = 1500.0
+    memory_mb: NonNegative = 1500.0
     """Larger takes are read block by block."""
-    unseen_weight: float = 0.05
+    unseen_weight: Share = 0.05
     """Weight of a vertex without scan data, beside 1 for one with: registration guessed it."""
-    filling_rounds: int = 6
+    filling_rounds: Whole = 6
     """How often unseen vertices are filled in from the model and the model learned again."""
 
 
-@dataclass(frozen=True)
+@settings
 class SplitConfig:
     """Which clips are learned from, and which decide. Clips are never cut between neighbouring frames."""
 
@@ -37,22 +49,22 @@ class SplitConfig:
     """Takes to validate on, by the name of their work folder; chosen at random if absent."""
     held_out: tuple[str, ...] = ()
     """Takes that learning never sees."""
-    validation_share: float = 0.15
+    validation_share: Part = 0.15
     """Part of the frames to validate on."""
-    gap_s: float = 0.5
+    gap_s: NonNegative = 0.5
     """Seconds left out on both sides of a cut, where one take has to be cut because it is the only one."""
-    seed: int = 0
+    seed: Seed = 0
 
 
-@dataclass(frozen=True)
+@settings
 class ControlConfig:
     """What drives the garment: by default the paper's control vector."""
 
-    joint_share: float = 0.004
+    joint_share: Share = 0.004
     """A joint belongs to the garment if it carries this share of its skin weights."""
     root_motion: bool = True
     """Velocity and acceleration of the root, in the root's frame."""
-    derivative_frames: int = 5
+    derivative_frames: Annotated[int, Range(least=3)] = 5
     """Frames, the present one and those before, through which a parabola is laid for them; 3 are plain differences,
     more are less noisy."""
     up: bool = False
@@ -61,46 +73,46 @@ class ControlConfig:
     """Angular velocities of the garment's joints and of the root as well."""
     whole_rotations: bool = False
     """How the garment's joints are turned against the root, all joints between taken together, as well."""
-    lags: tuple[int, ...] = ()
+    lags: tuple[Count, ...] = ()
     """How far the rotations have come in so many frames as well: cloth that slid up an arm is slow to come down."""
-    history: int = 0
+    history: Whole = 0
     """Coefficients of so many frames before, as predicted (the autoregressive variant)."""
 
 
-@dataclass(frozen=True)
+@settings
 class LinearConfig:
     """Linear regression from control vectors to coefficients."""
 
     fit: Literal["ridge", "moore-penrose"] = "ridge"
     """Least squares with an intercept, or F = L T^+ as the paper prints it, without."""
-    ridges: tuple[float, ...] = (1e-3, 1e-2, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
+    ridges: Annotated[tuple[NonNegative, ...], NotEmpty] = (1e-3, 1e-2, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
     """Penalties to choose from on the validation clips, relative to the variance of a standardised control. Without any
     (0), what the validation clips could not show goes wild in a motion that has it."""
 
 
-@dataclass(frozen=True)
+@settings
 class KernelTuningConfig:
     """Tuning of the kernels by leaving out each take in turn."""
 
     enabled: bool = True
     """Off: a control counts by as much as the linear regression says, and all kinds of kernels alike."""
-    least_takes: int = 3
+    least_takes: Annotated[int, Range(least=2)] = 3
     """With fewer takes there is nothing to tell by."""
-    line: float = 0.1
+    line: NonNegative = 0.1
     """Weight with which a linear kernel begins, beside 1 of all others. It goes on where no learned frame is near, for
     better or worse, so without tuning there is none."""
-    frames: int = 600
+    frames: Annotated[int, Range(least=2)] = 600
     """From so many frames, evenly spread; time grows with their cube."""
-    rounds: int = 30
+    rounds: Count = 30
     """Steps of L-BFGS at most."""
-    restraint: float = 0.01
+    restraint: NonNegative = 0.01
     """Penalty on the squared logarithms of the factors, beside the mean logarithm of the takes' squared errors;
     chosen on takes that were kept even from the tuning."""
-    kept: float = 0.995
+    kept: Annotated[float, Range(above=0, most=1)] = 0.995
     """Share of the coefficients' square in the principal directions that are looked at."""
 
 
-@dataclass(frozen=True)
+@settings
 class KernelConfig:
     """Kernel ridge regression from control vectors to coefficients."""
 
@@ -108,26 +120,30 @@ class KernelConfig:
         default_factory=lambda: ControlConfig(whole_rotations=True, lags=(6, 18))  # 0.1 and 0.3 s at 60 fps
     )
     """Its own control vector, more than the paper's."""
-    length: float = 3.0
+    length: Positive = 3.0
     """Square of the width of the kernel over everything, relative to the mean squared distance of two frames."""
-    side_length: float = 1.5
+    side_length: Positive = 1.5
     """The same of the kernels over the sides of the body."""
-    ridges: tuple[float, ...] = (0.15,)
+    ridges: Annotated[tuple[Positive, ...], NotEmpty] = (0.15,)
     """Penalty; a frame's likeness to itself is 1 before tuning, which goes by the first. Of several the validation
     clips choose, badly if they are few."""
     tuning: KernelTuningConfig = field(default_factory=KernelTuningConfig)
-    most_frames: int = 4000
+    most_frames: Annotated[int, Range(least=2)] = 4000
     """Learn from no more frames than so many, evenly spread: memory grows with their square, time with their cube."""
 
+    def __post_init__(self) -> None:
+        if self.control.history:
+            raise SettingError(self, "control.history", "0, for kernels carry nothing on", self.control.history)
 
-@dataclass(frozen=True)
+
+@settings
 class LstmConfig:
     """The sequence-to-sequence network: encoder and decoder of the same size."""
 
-    layers: int = 1
+    layers: Count = 1
     """The paper has 4; on a thousand frames they generalise worse than one."""
-    size: int = 256
-    window: int = 3
+    size: Count = 256
+    window: Count = 3
     """Frames in and frames out."""
     over_linear: bool = True
     """Learn what the linear regression leaves; off, as in the paper, the whole."""
@@ -135,35 +151,35 @@ class LstmConfig:
     """Give controls the size of what the garment moves with them; off, one size to all of a kind."""
 
 
-@dataclass(frozen=True)
+@settings
 class TrainingConfig:
     """One training run."""
 
-    epochs: int = 0
+    epochs: Whole = 0
     """The learning rate falls to zero over them, along a cosine. 0: thirty, or as many as make 500 steps."""
-    batch: int = 128
-    learning_rate: float = 1e-3
-    weight_decay: float = 2.0
+    batch: Count = 128
+    learning_rate: Positive = 1e-3
+    weight_decay: NonNegative = 2.0
     """Decoupled from the gradient (AdamW)."""
-    control_noise: float = 0.15
+    control_noise: NonNegative = 0.15
     """Standard deviation of noise on the standardised controls, drawn anew for every window."""
-    teacher_forcing: float = 0.0
+    teacher_forcing: Share = 0.0
     """Probability that a step of the decoder is given the true coefficients of the step before, not its own."""
     loss: Literal["coefficients", "whitened"] = "coefficients"
     """Squared error of the coefficients, as it is measured, or of the whitened ones, in which the last direction counts
     as much as the first."""
-    clip_gradient: float = 1.0
+    clip_gradient: Positive = 1.0
     """Largest norm of a gradient."""
-    patience: int = 40
+    patience: Count = 40
     """Epochs without improvement on the validation clips after which to stop."""
-    checkpoint_s: float = 30.0
+    checkpoint_s: NonNegative = 30.0
     """Seconds between checkpoints; they change nothing in the result."""
-    threads: int = 1
+    threads: Count = 1
     """Threads of torch; results are the same bits only for the same number."""
-    seed: int = 0
+    seed: Seed = 0
 
 
-@dataclass(frozen=True)
+@settings
 class FitConfig:
     """Learning a garment."""
 
@@ -183,70 +199,24 @@ class FitConfig:
     training: TrainingConfig = field(default_factory=TrainingConfig)
 
 
-def check_fit(config: FitConfig) -> None:
-    """
-    Raises:
-        InputError: a setting is out of range; the message names it.
-    """
-    shape, control, kernel, training = config.shape, config.control, config.kernel, config.training
-    least = {
-        "shape.components": (shape.components, 0),
-        "shape.most_components": (shape.most_components, 1),
-        "shape.filling_rounds": (shape.filling_rounds, 0),
-        "kernel.most_frames": (kernel.most_frames, 2),
-        "kernel.tuning.least_takes": (kernel.tuning.least_takes, 2),
-        "kernel.tuning.frames": (kernel.tuning.frames, 2),
-        "kernel.tuning.rounds": (kernel.tuning.rounds, 1),
-        "kernel.tuning.restraint": (kernel.tuning.restraint, 0),
-        "kernel.tuning.line": (kernel.tuning.line, 0),
-        "lstm.layers": (config.lstm.layers, 1),
-        "lstm.size": (config.lstm.size, 1),
-        "lstm.window": (config.lstm.window, 1),
-        "training.epochs": (training.epochs, 0),
-        "training.batch": (training.batch, 1),
-        "training.patience": (training.patience, 1),
-        "training.threads": (training.threads, 1),
-        "control.history": (control.history, 0),
-        "control.derivative_frames": (control.derivative_frames, 3),
-        "kernel.control.derivative_frames": (kernel.control.derivative_frames, 3),
-    }
-    for name, lags in (("control.lags", control.lags), ("kernel.control.lags", kernel.control.lags)):
-        least |= {name: (min(lags, default=1), 1)}
-    for name, (value, bound) in least.items():
-        if value < bound:
-            raise InputError(f"{name}: expected at least {bound}, found {value}")
-    if kernel.control.history:
-        raise InputError(
-            f"kernel.control.history: expected 0, found {kernel.control.history}; kernels carry nothing on"
-        )
-    for name, ridges in (("linear.ridges", config.linear.ridges), ("kernel.ridges", kernel.ridges)):
-        if not ridges or min(ridges) < 0 or (name == "kernel.ridges" and min(ridges) == 0):
-            raise InputError(f"{name}: expected positive penalties, found {' '.join(map(str, ridges)) or 'none'}")
-    if not 0 < kernel.tuning.kept <= 1:
-        raise InputError(f"kernel.tuning.kept: expected a share above 0, up to 1, found {kernel.tuning.kept:g}")
-    if not 0 <= config.split.validation_share < 1:
-        found = config.split.validation_share
-        raise InputError(f"split.validation_share: expected a share from 0 to below 1, found {found:g}")
-
-
-@dataclass(frozen=True)
+@settings
 class RemovalConfig:
     """Taking the garment out of the body."""
 
     enabled: bool = True
-    margin_mm: float = 2.0
+    margin_mm: NonNegative = 2.0
     """How far outside the body its vertices are put."""
-    stay: float = 1.0
+    stay: Positive = 1.0
     """Weight of staying in place, for the vertices that are outside (1 in TailorNet's code)."""
-    leave: float = 4.0
+    leave: Positive = 4.0
     """Weight of reaching the outside, for those that are not (4 in TailorNet's code); each round doubles it."""
-    rounds: int = 6
+    rounds: Whole = 6
     """Searches for vertices inside; what is left is moved straight out."""
     faces: bool = True
     """Also where the body pokes through a face of the garment whose corners are all outside."""
 
 
-@dataclass(frozen=True)
+@settings
 class AnimateConfig:
     """Putting a learned garment on a motion and a body."""
 
@@ -255,6 +225,6 @@ class AnimateConfig:
     mean: Literal["corrected", "printed", "captured"] = "corrected"
     """How the mean meets another body: moved by the difference of the two bodies (Eq. 5, corrected), by the new body's
     whole offset from the average person (as printed), or not at all."""
-    unlike_deg: float = 10.0
+    unlike_deg: NonNegative = 10.0
     """A pose farther than this from every training pose is reported, unless the model was validated farther away."""
     removal: RemovalConfig = field(default_factory=RemovalConfig)

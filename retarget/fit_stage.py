@@ -32,7 +32,7 @@ from capture4d.files.records import load_garment, save_body
 from capture4d.runs.stage import Stage, StageResult, open_stage, require_complete
 from capture4d.runs.workers import run_jobs
 from capture4d.types import BlendshapeModel, Body, PoseSequence
-from retarget.config import FitConfig, check_fit
+from retarget.config import FitConfig
 from retarget.garment_model import KERNEL, LINEAR, LSTM, MODEL, POSES, model_digest_of, piece_name, regressors_by_name
 from retarget.regression.controls import ControlLayout
 from retarget.regression.kernel import KernelRegressor, fit_kernel, load_kernel, save_kernel
@@ -80,10 +80,8 @@ def run(
         works: work folders, each with a finished registration/, in any order. Their names are the takes' names.
         device: of the training.
     Raises:
-        InputError: a registration is missing, takes do not fit together, a setting is out of range, or there are too
-            few good frames.
+        InputError: a registration is missing, takes do not fit together, or there are too few good frames.
     """
-    check_fit(config)
     works = sorted(works, key=lambda work: work.resolve().name)
     names = [work.resolve().name for work in works]
     if len(set(names)) != len(names):

@@ -2,36 +2,38 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Annotated
+
+from capture4d.settings import NonNegative, Part, Positive, Range, settings
 
 __all__ = ["CALIBRATION", "RIG_CHECK", "CalibrationConfig", "RigCheckConfig"]
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class CalibrationConfig:
     """How a rig is calibrated."""
 
     floor: str | None = None
     """Pose at which the board lies on the floor, printed side up: the world's origin and its Y axis."""
-    hold_out: float = 0.15
+    hold_out: Part = 0.15
     """Share of the poses that a second calibration leaves out and is measured on; 0 spares it."""
     flatness: bool = True
     """Solve once more with the shape of the board unknown."""
-    start_loss_px: float = 1.0
+    start_loss_px: Positive = 1.0
     """Scale of the loss while start values are still millimetres off."""
-    loss_sigmas: float = 2.385
+    loss_sigmas: Positive = 2.385
     """Scale of the final loss in standard deviations: Cauchy's loss is then 95 % efficient on Gaussian noise."""
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class RigCheckConfig:
     """When a camera counts as moved."""
 
-    false_alarms: float = 2e-4
+    false_alarms: Annotated[float, Range(above=0, below=1)] = 2e-4
     """Share of checks of an untouched rig that may blame a camera."""
-    floor_mm: float = 0.03
+    floor_mm: NonNegative = 0.03
     """Standard deviation granted to every camera beyond its own: real lenses are not quite their model."""
-    floor_deg: float = 0.001
+    floor_deg: NonNegative = 0.001
     """The same for its direction."""
 
 

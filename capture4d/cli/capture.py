@@ -12,6 +12,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 from capture4d.calibration.config import CalibrationConfig, RigCheckConfig
 from capture4d.cli.exit_codes import BAD_RESULT, GOOD
 from capture4d.cli.options import all_cores
+from capture4d.settings import Count, Positive
 
 __all__ = ["Calibrate", "Check", "CheckRig"]
 
@@ -24,7 +25,7 @@ class Check:
     """Capture folder, or just a folder of scans."""
     frames: str | None = None
     """How scans are named, such as "take_{frame}.ply"; else the last number in a name is the frame's."""
-    fps: float | None = None
+    fps: Positive | None = None
     """Frame rate, if capture.json does not say, or is to be doubted."""
     units: Literal["m", "cm", "mm", "in"] | None = None
     """What the scans are said to be in, likewise."""
@@ -46,7 +47,7 @@ class Check:
     """Exit code 3 for warnings, too."""
     json: bool = False
     """Print JSON instead of a table."""
-    workers: int = field(default_factory=all_cores)
+    workers: Count = field(default_factory=all_cores)
     """Processes to use; the result does not depend on it."""
 
     def __call__(self) -> int:
@@ -91,7 +92,7 @@ class Calibrate:
     """rig.json to write; calibration.json and calibration.html go beside it."""
     pattern: str = "{camera}/{pose}"
     """How the images lie in the folder, without their ending."""
-    workers: int = field(default_factory=all_cores)
+    workers: Count = field(default_factory=all_cores)
     """Processes to use; the result does not depend on it."""
     colmap: Path | None = None
     """Folder for the rig as a COLMAP model as well."""
@@ -128,7 +129,7 @@ class CheckRig:
     """The board, if it is not the one of the calibration."""
     pattern: str = "{camera}/{pose}"
     """How the images lie in the folder, without their ending."""
-    workers: int = field(default_factory=all_cores)
+    workers: Count = field(default_factory=all_cores)
     """Processes to use; the result does not depend on it."""
     config: Annotated[RigCheckConfig, arg(name="")] = field(default_factory=RigCheckConfig)
 

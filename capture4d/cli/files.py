@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from capture4d.cli.exit_codes import BAD_RESULT, GOOD
+from capture4d.settings import Positive, Whole
 from registration.config import MeshRegistrationConfig
 
 __all__ = ["ConvertBody", "ConvertPoses", "ConvertRig", "RegisterMesh", "Template"]
@@ -28,7 +29,7 @@ class Template:
     poses: Path | None = None
     """Motion file with the pose and the shape in which the garment lies on the body; the rest pose of the mean shape if
     absent."""
-    frame: int | None = None
+    frame: Whole | None = None
     """Frame of that file, by its number; the first if absent."""
     region: Literal["tshirt", "longsleeve", "trousers", "shorts"] | None = None
     """Take this part of the body as the garment."""
@@ -136,7 +137,7 @@ class ConvertPoses:
     """The body that moves, a body.npz; the built-in one if absent."""
     format: Literal["poses", "amass"] = "poses"
     """What kind of .npz to write."""
-    fps: float | None = None
+    fps: Positive | None = None
     """Frame rate of the result; that of the input if absent."""
 
     def __call__(self) -> int:

@@ -22,12 +22,14 @@ import tyro
 from capture4d.cli.capture import Calibrate, Check, CheckRig
 from capture4d.cli.demo import Demo
 from capture4d.cli.exit_codes import BAD_COMMAND_LINE, BAD_INPUT, GOOD, INTERRUPTED, TERMINATED
+from capture4d.cli.faults import check_command
 from capture4d.cli.files import ConvertBody, ConvertPoses, ConvertRig, RegisterMesh, Template
 from capture4d.cli.models import Animate, Fit
 from capture4d.cli.stages import Extract, Register, Report, Run, Track
 from capture4d.cli.synthesis import Scan, Synth, SynthBoard
 from capture4d.cli.wrinkles import Compare, WrinklesApply, WrinklesMaps, WrinklesTrain
 from capture4d.errors import InputError
+from capture4d.settings import gathered_faults
 from data_synth import config as synth_config
 from registration import config as registration_config
 from wrinkles.normal_maps import config as wrinkle_config
@@ -156,16 +158,15 @@ def _dispatch(arguments: list[str]) -> int:
         near = difflib.get_close_matches(name, COMMANDS, n=1)
         hint = f"; did you mean '{near[0]}'?" if near else ""
         return _complain(f"unknown command '{name}'{hint} (see capture4d --help)", code=BAD_COMMAND_LINE)
-    command = _parse(name, rest)
-    if getattr(command, "workers", 1) < 1:
-        raise InputError(f"--workers: expected at least 1, found {command.workers}")
-    if not 0 <= getattr(command, "max_failed", 0) <= 100:
-        raise InputError(f"--max-failed: expected a percentage between 0 and 100, found {command.max_failed:g}")
-    return command()
+    return _parse(name, rest)()
 
 
 def _parse(name: str, arguments: list[str]) -> Any:
-    """The command with its options. A --preset decides what the other settings start from."""
+    """The command with its options. A --preset decides what the other settings start from.
+
+    Raises:
+        InputError: an option is out of range.
+    """
     command = COMMANDS[name]
     presets = _PRESETS.get(command)
     default = None
@@ -178,7 +179,10 @@ def _parse(name: str, arguments: list[str]) -> Any:
                 if entry.default is entry.default_factory is dataclasses.MISSING
             }
             default = command(**required, preset=given, config=presets[given])
-    return tyro.cli(command, prog=f"capture4d {name}", args=arguments, default=default)
+    with gathered_faults() as faults:  # tyro would print a page about each
+        parsed = tyro.cli(command, prog=f"capture4d {name}", args=arguments, default=default)
+    check_command(parsed, faults, arguments)
+    return parsed
 
 
 def _value_of(option: str, arguments: list[str]) -> str | None:

@@ -11,6 +11,7 @@ from tyro.conf import Positional, arg
 from capture4d.cli.exit_codes import GOOD
 from capture4d.cli.options import GradedOptions, StageOptions
 from capture4d.errors import InputError
+from capture4d.settings import Number
 from retarget.config import AnimateConfig, FitConfig
 
 __all__ = ["Animate", "Fit"]
@@ -55,7 +56,7 @@ class Animate(GradedOptions):
     """Work folder; gets body/ and registration/."""
     body: Path | None = None
     """Another person, a body.npz of the same faces and joints."""
-    beta: tuple[float, ...] | None = None
+    beta: tuple[Number, ...] | None = None
     """Shape of the person, in standard deviations; the captured person without --body and --beta."""
     device: str = "cpu"
     """Where torch computes, such as cpu or cuda."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from capture4d.cli.exit_codes import BAD_RESULT, GOOD
+from capture4d.settings import Count, Percent
 
 if TYPE_CHECKING:
     from capture4d.runs.stage import StageResult
@@ -21,7 +22,7 @@ def all_cores() -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class StageOptions:
-    workers: int = field(default_factory=all_cores)
+    workers: Count = field(default_factory=all_cores)
     """Processes to use; the result does not depend on it."""
     overwrite: bool = False
     """Start clean: delete what an earlier run left in the output folder."""
@@ -31,7 +32,7 @@ class StageOptions:
 class GradedOptions(StageOptions):
     """Of stages whose frames can fail."""
 
-    max_failed: float = 5.0
+    max_failed: Percent = 5.0
     """Percent of frames that may fail; more of them end in exit code 3."""
 
     def graded(self, result: StageResult) -> int:

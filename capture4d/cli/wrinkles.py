@@ -11,6 +11,7 @@ from tyro.conf import Positional, arg
 from capture4d.app.compare.config import CompareConfig
 from capture4d.cli.exit_codes import GOOD
 from capture4d.cli.options import StageOptions, all_cores
+from capture4d.settings import Count
 from wrinkles.normal_maps import config as wrinkle_config
 from wrinkles.normal_maps.config import PairConfig, WrinkleConfig
 
@@ -51,7 +52,7 @@ class WrinklesTrain(StageOptions):
     """What the settings below start from; `paper` is DeepWrinkles' network."""
     config: Annotated[WrinkleConfig, arg(name="")] = field(default_factory=lambda: wrinkle_config.PRESETS["small"])
     pairs: PairConfig = field(default_factory=PairConfig)
-    workers: int = field(default_factory=all_cores)
+    workers: Count = field(default_factory=all_cores)
     """Processes for the maps, threads for the training; equal numbers give equal weights."""
 
     def __call__(self) -> int:

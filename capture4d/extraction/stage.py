@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,6 +27,7 @@ from capture4d.files.arrays import ArrayFile
 from capture4d.files.atomic import write_json, write_npz
 from capture4d.runs.stage import Stage, StageResult, open_stage
 from capture4d.runs.workers import run_jobs
+from capture4d.settings import Count, settings
 from capture4d.types import GarmentScan
 
 __all__ = ["ExtractionSettings", "flagged_frames", "run"]
@@ -35,11 +35,11 @@ __all__ = ["ExtractionSettings", "flagged_frames", "run"]
 SCHEMA = 4
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class ExtractionSettings:
     """What decides the result, besides the capture."""
 
-    schema: int = SCHEMA
+    schema: Count = SCHEMA
     learn_colours: bool = False
     """Learn all colours from the scans, not only those that capture.json leaves open."""
 

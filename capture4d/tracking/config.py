@@ -2,77 +2,79 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
+
+from capture4d.settings import Cosine, Count, NonNegative, Positive, Share, settings
 
 __all__ = ["ColdStartConfig", "FitConfig", "SamplingConfig", "Schedule", "SequenceConfig", "TrackingConfig"]
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class SamplingConfig:
     """How many points a scan gives."""
 
-    body_cell_m: float = 0.016
+    body_cell_m: Positive = 0.016
     """One point per cell of this size on skin and suit."""
-    cloth_cell_m: float = 0.028
+    cloth_cell_m: Positive = 0.028
     """The same on the garment."""
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class Schedule:
     """The course of one fit."""
 
-    iterations: int = 4
+    iterations: Count = 4
     """Gauss-Newton steps at most."""
-    first_scale_m: float = 0.05
+    first_scale_m: Positive = 0.05
     """Distance at which a point has lost most of its weight, at first, ..."""
-    last_scale_m: float = 0.015
+    last_scale_m: Positive = 0.015
     """... and in the end."""
-    stop_m: float = 1e-4
+    stop_m: NonNegative = 1e-4
     """The fit is done once no step moves anything farther than this."""
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class FitConfig:
     """Weights of the terms. Figures from `python -m benchmarks tracking`, on other settings of the same takes."""
 
-    point_sigma_m: float = 0.008
+    point_sigma_m: Positive = 0.008
     """Error of one point: noise, and what the body model cannot follow. Neighbouring points err alike, so it is larger
     than the noise."""
-    mismatch: float = 0.25
+    mismatch: NonNegative = 0.25
     """Error of a match, as a share of the distance at which points lose their weight: wide searches trust them less."""
-    turn_step: float = 0.3
+    turn_step: Positive = 0.3
     """Levenberg damping: the turn, radians (or metres), of one step that costs as much as one standard deviation."""
-    shape_step: float = 1.0
+    shape_step: Positive = 1.0
     """The same for shape coefficients."""
-    cloth_gap_m: float = 0.004
+    cloth_gap_m: NonNegative = 0.004
     """Distance that cloth keeps from skin where it touches."""
-    cloth_pull: float = 0.02
+    cloth_pull: NonNegative = 0.02
     """Weight of cloth points outside the body, against 1 inside: where cloth nearly touches it shows the body."""
-    cloth_pull_reach_m: float = 0.008
+    cloth_pull_reach_m: Positive = 0.008
     """Distance at which that weight is gone."""
-    normal_cosine: float = 0.3
+    normal_cosine: Cosine = 0.3
     """Points whose normal differs more from the body's are left out."""
-    limit_softness_deg: float = 4.0
+    limit_softness_deg: Positive = 4.0
     """Overshoot of a joint limit that weighs as much as one standard deviation."""
-    shape_spread: float = 1.0
+    shape_spread: Positive = 1.0
     """Standard deviation of the shape coefficients before any scan."""
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class ColdStartConfig:
     """The search for the first pose."""
 
-    facings: int = 8
+    facings: Count = 8
     """Directions, all round, that the subject may face."""
-    points: int = 700
+    points: Count = 700
     """Points of the scan that the search reads."""
-    survivors: int = 6
+    survivors: Count = 6
     """Starts that are followed up with other poses of legs and arms."""
-    finalists: int = 4
+    finalists: Count = 4
     """Starts that are fitted in full."""
-    second_round_m: float = 0.012
+    second_round_m: NonNegative = 0.012
     """Misfit of the winner beyond which its limbs are tried again: 11 mm at most where all is right."""
-    shape_spread: float = 0.15
+    shape_spread: Positive = 0.15
     """Standard deviation of the shape coefficients while the search is on."""
     rough: Schedule = Schedule(iterations=12, first_scale_m=0.25, last_scale_m=0.06)
     """Of every start."""
@@ -84,7 +86,7 @@ class ColdStartConfig:
     """... and in full."""
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class SequenceConfig:
     """From frame to frame."""
 
@@ -94,42 +96,42 @@ class SequenceConfig:
     """Of a frame that this did not fit."""
     refine: Schedule = Schedule(iterations=3, first_scale_m=0.02, last_scale_m=0.015)
     """Of the second pass, with the one shape of the take."""
-    momentum: float = 0.9
+    momentum: Share = 0.9
     """Share of the last motion that is expected to go on."""
-    motion_spread: float = 0.2
+    motion_spread: Positive = 0.2
     """Standard deviation of a joint's turn from what is expected, radians a frame."""
-    acceleration: float = 10.0
+    acceleration: Positive = 10.0
     """How fast the turning of a joint changes, radians a second squared: the second pass draws a frame so much towards
     the mean of its neighbours."""
-    shape_memory: float = 0.99
+    shape_memory: Share = 0.99
     """Share of what is known about the shape that is kept from frame to frame."""
-    search_every: int = 15
+    search_every: Count = 15
     """Lost frames between two searches for the pose."""
-    explained_m: float = 0.012
+    explained_m: Positive = 0.012
     """A point of skin or suit is explained by the body if it is this near."""
-    check_explained: float = 0.85
+    check_explained: Share = 0.85
     """Frames with a smaller share of explained points are flagged."""
-    check_median_m: float = 0.0025
+    check_median_m: NonNegative = 0.0025
     """Frames whose median distance on skin and suit is larger are flagged: a body that faces backwards can lie within
     12 mm of most points, but not this close. Raise it for scans noisier than that."""
-    outlier_median: float = 2.0
+    outlier_median: NonNegative = 2.0
     """Frames are flagged as well if that distance is so many times what is usual in the take, ..."""
-    least_outlier_m: float = 0.001
+    least_outlier_m: NonNegative = 0.001
     """... and larger than this."""
-    check_far: float = 0.03
+    check_far: Share = 0.03
     """Frames with a larger share of skin and suit farther than `far_m` from the body, or facing elsewhere, are flagged:
     a whole arm is 4 to 6 %."""
-    far_m: float = 0.05
+    far_m: NonNegative = 0.05
     """Distance of a point that belongs to another part of the body."""
-    fail_explained: float = 0.6
+    fail_explained: Share = 0.6
     """Frames with a smaller share are lost: nothing is built upon them."""
-    largest_shape: float = 3.5
+    largest_shape: NonNegative = 3.5
     """Frames that need a shape coefficient beyond this are flagged: the pose is wrong, or the body."""
-    least_points: int = 150
+    least_points: Count = 150
     """Frames with fewer points on skin and suit are lost as well."""
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class TrackingConfig:
     """Everything that decides a take's poses."""
 

@@ -8,8 +8,7 @@ for the sensor.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import no_type_check
+from typing import Annotated, no_type_check
 
 import cv2
 import numpy as np
@@ -18,6 +17,7 @@ from numba import njit
 
 from capture4d.cameras.board import Board
 from capture4d.cameras.projection import project, transform, undistort
+from capture4d.settings import NonNegative, Range, Whole, settings
 from capture4d.types import Rig
 
 __all__ = ["DEFAULT", "BoardImageConfig", "photograph_board"]
@@ -29,23 +29,26 @@ FAR_M = 1e6
 """Where the outermost cells of the pattern end, the background."""
 
 
-@dataclass(frozen=True, slots=True)
+Grey = Annotated[float, Range(least=0, most=255)]
+
+
+@settings
 class BoardImageConfig:
     """What stands between the board and the pixels."""
 
-    blur_px: float = 0.7
+    blur_px: NonNegative = 0.7
     """Standard deviation of the lens's blur."""
-    noise: float = 2.5
+    noise: NonNegative = 2.5
     """Standard deviation of the sensor's noise, grey levels of 255."""
-    ink: float = 30.0
-    paper: float = 215.0
-    background: float = 95.0
+    ink: Grey = 30.0
+    paper: Grey = 215.0
+    background: Grey = 95.0
     """Grey levels."""
-    margin_m: float = 0.02
+    margin_m: NonNegative = 0.02
     """White border around the squares."""
-    hands: int = 1
+    hands: Whole = 1
     """Discs that hide a part of the board's rim."""
-    hand_radius_m: float = 0.08
+    hand_radius_m: NonNegative = 0.08
 
 
 DEFAULT = BoardImageConfig()

@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from capture4d.cameras.board import Board, parse_board
-from capture4d.errors import InputError
 from capture4d.files.atomic import file_digest, write_bytes
 from capture4d.files.records import load_rig
 from capture4d.runs.stage import StageResult, open_stage
@@ -53,8 +52,6 @@ def run(rig_path: Path, images: Path, config: BoardConfig, *, workers: int = 1, 
         InputError: the board or the rig cannot be read, or the folder holds something else.
     """
     board, rig = parse_board(config.board), load_rig(rig_path)
-    if config.poses < 1:
-        raise InputError(f"--poses: expected at least 1, found {config.poses}")
     upstream = {"rig": file_digest([rig_path], root=rig_path.parent)}
     stage = open_stage(images, name="synth-board", schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite)
     poses, seen = _shoot(rig, board, config)

@@ -6,8 +6,10 @@ prints them). Lengths are metres unless the name says otherwise.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import field
+from typing import Annotated, Literal
+
+from capture4d.settings import Count, NonNegative, Odd, Part, Positive, Range, Seed, Share, Whole, settings
 
 __all__ = [
     "FusionConfig",
@@ -21,127 +23,129 @@ __all__ = [
 ]
 
 Lighting = Literal["even", "side", "two-temperature"]
+Cameras = Annotated[int, Range(least=4)]  # fewer leave a side of the subject unseen
+FieldOfView = Annotated[float, Range(above=0, below=180)]
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class RigConfig:
     """Where the cameras stand."""
 
-    cameras: int = 48
+    cameras: Cameras = 48
     """How many; 20 to 48 are sensible."""
-    image_size: int = 560
+    image_size: Count = 560
     """Width and height of the square images, pixels."""
-    field_of_view_deg: float = 48.0
+    field_of_view_deg: FieldOfView = 48.0
     """Full horizontal angle of view."""
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class NoiseConfig:
     """What the depth sensor does to the true depth."""
 
-    sigma_m: float = 0.0003
+    sigma_m: NonNegative = 0.0003
     """Standard deviation of the depth at `reference_depth_m`, seen head-on. It grows with the square of the depth."""
-    reference_depth_m: float = 1.5
+    reference_depth_m: Positive = 1.5
     """Depth at which `sigma_m` holds."""
-    correlation_px: float = 2.0
+    correlation_px: NonNegative = 2.0
     """Width of the Gaussian that correlates neighbouring pixels, as stereo matching windows do."""
-    grazing_floor: float = 0.25
+    grazing_floor: Annotated[float, Range(above=0, most=1)] = 0.25
     """Noise grows with 1/cos of the angle to the surface normal, down to this cosine."""
-    silhouette_step_m: float = 0.013
+    silhouette_step_m: Positive = 0.013
     """A larger step of depth between neighbouring pixels is a silhouette: both sides are lost."""
-    silhouette_loss: float = 0.5
+    silhouette_loss: Part = 0.5
     """Share of the next two pixels that is lost as well, in blobs."""
-    lost_cosine: float = 0.2
+    lost_cosine: Share = 0.2
     """Surfaces seen flatter than this cosine are lost."""
-    weak_cosine: float = 0.35
+    weak_cosine: Share = 0.35
     """Surfaces seen flatter than this cosine are lost in blobs."""
-    weak_loss: float = 0.38
+    weak_loss: Part = 0.38
     """Share of the weakly seen surface that is lost."""
-    blob_loss: float = 0.01
+    blob_loss: Part = 0.01
     """Share of any surface that is lost in blobs."""
-    blob_px: float = 5.0
+    blob_px: NonNegative = 5.0
     """Size of the blobs."""
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class ShadingConfig:
     """What light and lens do to the colours."""
 
     lighting: Lighting = "even"
     """even: from everywhere, and two weak lamps. side: one near lamp at the subject's left, whose light falls off.
     two-temperature: a warm lamp at the left, a cool one at the right."""
-    ambient: float = 0.72
+    ambient: Share = 0.72
     """Under even light, the share that comes from everywhere; the rest comes from two lamps."""
-    camera_gain: float = 0.03
+    camera_gain: NonNegative = 0.03
     """Standard deviation of each camera's exposure."""
-    pixel_noise: float = 0.015
+    pixel_noise: NonNegative = 0.015
     """Standard deviation of a pixel's colour, 1 = full scale."""
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class FusionConfig:
     """Fusion of the depth images by truncated signed distances, and the cleaning of the result."""
 
-    garment_voxel_m: float = 0.0027
-    body_voxel_m: float = 0.005
-    truncation_voxels: float = 3.0
+    garment_voxel_m: Positive = 0.0027
+    body_voxel_m: Positive = 0.005
+    truncation_voxels: Positive = 3.0
     """Open3D's default of 8 lets both sides of a sleeve interfere: four times the error."""
-    min_weight: float = 2.0
+    min_weight: NonNegative = 2.0
     """Cameras that must have seen a voxel."""
-    block_resolution: int = 8
+    block_resolution: Count = 8
     """Voxels along the edge of a block of the sparse grid."""
     inside: bool = False
     """Scan the inside of open sheets too, where it is seen, as a sheet of its own. Off, it is too dark to be scanned:
     the inside of hems and sleeves is a hole."""
-    thickness_m: float = 0.001
+    thickness_m: NonNegative = 0.001
     """Of open sheets: how far behind its outside their inside is scanned."""
-    min_component_faces: int = 400
+    min_component_faces: Whole = 400
     """Smaller connected pieces are dropped."""
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class StereoConfig:
     """Active stereo: pods of two cameras with a speckle projector between them, instead of depth cameras."""
 
-    pods: int = 14
+    pods: Cameras = 14
     """How many; they stand where the depth cameras of a rig of this size would."""
-    image_size: int = 1280
+    image_size: Count = 1280
     """Width and height of the square images, pixels. With 768 the hems of scans end askew: matches there mix cloth and
     leg within the matcher's window."""
-    field_of_view_deg: float = 48.0
+    field_of_view_deg: FieldOfView = 48.0
     """Full horizontal angle of view."""
-    baseline_m: float = 0.2
+    baseline_m: Positive = 0.2
     """Between the two cameras of a pod."""
-    supersampling: int = 1
+    supersampling: Count = 1
     """Rays along each side of a pixel of the speckle images."""
-    speckle_px: float = 0.9
+    speckle_px: Positive = 0.9
     """Standard deviation of a speckle's profile, camera pixels."""
-    ambient: float = 0.06
+    ambient: NonNegative = 0.06
     """Light that reaches the surface without the pattern, relative to the projector's, head-on at the pod's target."""
-    blur_px: float = 0.6
+    blur_px: NonNegative = 0.6
     """Standard deviation of the lens's blur."""
-    full_well: float = 9000.0
+    full_well: Positive = 9000.0
     """Electrons of a white pixel; their square root is the shot noise."""
-    read_noise: float = 12.0
+    read_noise: NonNegative = 12.0
     """Electrons, standard deviation."""
-    block_px: int = 5
+    block_px: Annotated[Count, Odd] = 5
     """Width of the matcher's window."""
-    uniqueness_percent: int = 8
+    uniqueness_percent: Annotated[int, Range(least=0, most=100)] = 8
     """Margin by which the best disparity has to beat the others."""
-    speckle_window_px: int = 400
+    speckle_window_px: Whole = 400
     """Smaller islands of disparity are dropped."""
-    refinement_steps: int = 4
+    refinement_steps: Whole = 4
     """Of the matches, on the intensities. Semi-global matching alone is up to 0.3 pixels off, towards whole ones; 4
     steps leave less than 0.1 on a wall. 0 leaves it out."""
-    lost_intensity: float = 0.02
+    lost_intensity: Share = 0.02
     """Darker pixels, 1 = full scale, are not matched: background, and what the projector does not reach."""
-    step_m: float = 0.012
+    step_m: NonNegative = 0.012
     """Pixels at a larger step of depth are dropped from the cleaned depth; 0 leaves the depth raw."""
-    min_weight: float = 1.0
+    min_weight: NonNegative = 1.0
     """Pods that must have seen a voxel. Pods overlap little."""
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class ScannerConfig:
     """The virtual 4D scanner."""
 
@@ -155,31 +159,31 @@ class ScannerConfig:
     fusion: FusionConfig = field(default_factory=FusionConfig)
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class ScanConfig:
     """How a sequence of meshes becomes a capture."""
 
-    height_m: float | None = None
+    height_m: Positive | None = None
     """Scale the sequence so that its first frame is this tall; None keeps the sizes as metres."""
     up: Literal["x", "y", "z"] = "y"
     """The axis of the meshes that points up."""
-    fps: float = 60.0
+    fps: Positive = 60.0
     """Frames per second of the sequence."""
-    first_frame: int = 0
+    first_frame: Whole = 0
     """Index of the first mesh to scan."""
-    frames: int | None = None
+    frames: Count | None = None
     """How many meshes to scan; None scans all."""
-    step: int = 1
+    step: Count = 1
     """Scan every n-th mesh."""
     garment_colour: str = "#2f62c9"
     """Colour of the surface."""
-    border_paint_m: float = 0.012
+    border_paint_m: NonNegative = 0.012
     """Width of the painted band along open borders; 0 paints none."""
     border_colours: tuple[str, ...] = ("#ffd200", "#e5332a", "#31b04a", "#f07be0", "#35c6d6", "#f28c1e")
     """Paint of the border loops, the longest loop first; fewer colours than loops are used in turn."""
-    template_vertices: int | None = None
+    template_vertices: Annotated[int, Range(least=4)] | None = None
     """Size of the template, made from the first frame by decimation; None takes the first mesh itself. Ignored where a
     template is given."""
-    seed: int = 0
+    seed: Seed = 0
     """Of the sensor noise."""
     scanner: ScannerConfig = field(default_factory=ScannerConfig)

@@ -96,8 +96,6 @@ def pod_rig(*, centre: Point, radius: float, config: StereoConfig) -> Rig:
     Args:
         centre, radius: sphere around what is to be captured, metres.
     """
-    if not config.baseline_m > 0:
-        raise InputError(f"baseline_m: expected a positive length in metres, found {config.baseline_m}")
     pods = capture_rig(
         centre=centre,
         radius=radius,

@@ -21,6 +21,7 @@ from jaxtyping import Float, Float32
 from torch import Tensor, nn
 
 from capture4d.errors import InputError
+from capture4d.settings import SettingError
 from retarget.config import LstmConfig
 from retarget.regression.controls import ControlLayout
 from retarget.regression.linear import LinearRegressor
@@ -168,7 +169,9 @@ def load_lstm(
     try:
         config = LstmConfig(**file.entry("lstm"))
     except TypeError as error:
-        raise InputError(f"{path}: expected the settings of an LSTM, found others ({error})") from None
+        raise InputError(f"expected the settings of an LSTM, found others ({error})", where=path) from None
+    except SettingError as fault:
+        raise fault.at(path) from None
     placed = usable_device(device)
     shapes = len(scales.std)
     network = EncoderDecoder(layout.size + layout.config.history * shapes, shapes, config)

@@ -18,6 +18,7 @@ from jaxtyping import Float, Float32, Float64
 
 from capture4d.errors import InputError
 from capture4d.files.tensors import TensorFile, read_tensors, write_tensors
+from capture4d.settings import SettingError
 from retarget.config import ControlConfig
 from retarget.regression.controls import ControlLayout
 
@@ -291,4 +292,6 @@ def _load_layout(file: TensorFile) -> ControlLayout:
         joints, parents = (tuple(int(joint) for joint in entry[name]) for name in ("joints", "parents"))
         return ControlLayout(tuple(entry["joint_names"]), joints, float(entry["fps"]), config, parents)
     except (KeyError, TypeError) as error:
-        raise InputError(f"{file.path}: damaged description of the controls ({error})") from None
+        raise InputError(f"damaged description of the controls ({error})", where=file.path) from None
+    except SettingError as fault:
+        raise fault.at(file.path) from None

@@ -24,6 +24,7 @@ from capture4d.files.records import save_garment
 from capture4d.geometry.tangents import corner_tangents
 from capture4d.runs.stage import Stage, StageResult, open_stage
 from capture4d.runs.workers import run_jobs
+from capture4d.settings import settings
 from wrinkles.normal_maps.inference import WrinkleModel, load_model
 from wrinkles.normal_maps.pair_files import layout_digest
 from wrinkles.normal_maps.seams import SeamTable, seam_table
@@ -36,7 +37,7 @@ SCHEMA = 2
 CHUNK = 32
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class ApplyConfig:
     """The form of the maps."""
 

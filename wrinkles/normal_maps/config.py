@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from dataclasses import field, replace
+from typing import Annotated, Literal
+
+from capture4d.settings import Count, Degrees, NonNegative, Odd, Part, Positive, Seed, Share, Whole, settings
 
 __all__ = [
     "PRESETS",
@@ -21,40 +23,40 @@ __all__ = [
 TemporalLoss = Literal["printed", "l1", "l2", "none"]
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class MapConfig:
     """The image in which normals lie."""
 
-    size: int = 256
+    size: Count = 256
     """Texels along each side."""
-    padding: int = 4
+    padding: Whole = 4
     """Texels around the UV islands that repeat the nearest surface point."""
     layout: Literal["auto", "keep", "pack"] = "auto"
     """UVs in the unit square are kept, patterns in metres packed into it (auto); or one of the two always."""
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class ProjectionConfig:
     """How a scan is read from the template. On simulated scans, gates of 10-15 mm and 60 deg left a fifth of the
     wrinkle energy that gates of 4-6 mm and 45 deg leave."""
 
-    distance_m: float = 0.006
+    distance_m: NonNegative = 0.006
     """A scan farther than this from the template says nothing."""
-    angle_deg: float = 45.0
+    angle_deg: Degrees = 45.0
     """Nor does one that faces another way by more than this."""
-    border_rings: int = 1
+    border_rings: Whole = 1
     """Rings of scan vertices along open borders that are not trusted: 1 is the border itself, 0 trusts all."""
-    smoothing_passes: int = 1
+    smoothing_passes: Whole = 1
     """Steps of half-way averaging of the scan's normals with their neighbours'."""
-    temporal_frames: int = 3
+    temporal_frames: Annotated[Count, Odd] = 3
     """Frames averaged in tangent space, an odd number."""
-    temporal_span_s: float = 0.02
+    temporal_span_s: NonNegative = 0.02
     """Neighbours farther apart in time are left out: the cloth itself has moved."""
-    blur_texels: float = 0.4
+    blur_texels: NonNegative = 0.4
     """Standard deviation of the blur, texels of a map of 256."""
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class PairConfig:
     """Pairs of low- and high-resolution normal maps."""
 
@@ -62,72 +64,72 @@ class PairConfig:
     projection: ProjectionConfig = field(default_factory=ProjectionConfig)
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class NetworkConfig:
     """Generator and discriminator (DeepWrinkles 4.1; Isola et al. 2017, appendix)."""
 
-    filters: int = 64
+    filters: Count = 64
     """In the first convolution of both."""
-    layers: int = 8
+    layers: Count = 8
     """Down and up convolutions each; the map is 2^layers texels wide, or a multiple."""
     output: Literal["absolute", "residual"] = "absolute"
     """What the generator's tanh is: the normals, or what to add to those of the input."""
-    dropout: float = 0.5
+    dropout: Part = 0.5
     """In three inner layers of the decoder."""
     norm_at_test: Literal["instance", "running"] = "running"
     """Statistics of batch norm when maps are made: those of the map itself, as in pix2pix, or training's means."""
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class LossConfig:
     """L = gan * L_GAN + data * L_data + temporal * L_temp (DeepWrinkles, Eq. 3-4)."""
 
-    gan: float = 1.0
-    data: float = 100.0
-    temporal: float = 50.0
+    gan: NonNegative = 1.0
+    data: NonNegative = 100.0
+    temporal: NonNegative = 50.0
     temporal_kind: TemporalLoss = "printed"
     """`printed` is Eq. 4, the net change of each channel; l1 and l2 compare texel by texel. The small presets take l2,
     with which maps are better and flicker less (`python -m benchmarks wrinkles`)."""
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class AugmentationConfig:
     """Changes of the training pairs. Flips and crops would break the UVs and are not among them."""
 
-    turn_deg: float = 0.0
+    turn_deg: NonNegative = 0.0
     """Standard deviation of a common rotation of low and high normals about the vertical."""
-    noise: float = 0.0
+    noise: NonNegative = 0.0
     """Standard deviation of noise on the input normals."""
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class ScheduleConfig:
     """How long to train, and what to keep."""
 
-    steps: int = 20_000
-    batch: int = 1
-    learning_rate: float = 2e-4
-    beta1: float = 0.5
-    decay_from: float = 0.5
+    steps: Count = 20_000
+    batch: Count = 1
+    learning_rate: Positive = 2e-4
+    beta1: Part = 0.5
+    decay_from: Share = 0.5
     """Share of the steps after which the learning rate falls linearly to zero."""
-    checkpoint_every: int = 500
-    sample_every: int = 500
+    checkpoint_every: Count = 500
+    sample_every: Count = 500
     """Steps between sheets of sample maps."""
-    log_every: int = 20
+    log_every: Count = 20
     half_precision: bool = False
     """Compute in bfloat16 where torch thinks it safe; on a CPU it pays from 32 filters up."""
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class WrinkleConfig:
     """Learning high-resolution normal maps from low ones."""
 
-    seed: int = 0
-    held_out: float = 0.1
+    seed: Seed = 0
+    held_out: Part = 0.1
     """Share at the end of every take that is left out of training, to be drawn and measured."""
-    held_out_gap: int = 10
+    held_out_gap: Whole = 10
     """Frames between the two that belong to neither; neighbours are too alike."""
-    texels: int = 256
+    texels: Count = 256
     """Side of the maps to learn; pairs are halved until they fit."""
     network: NetworkConfig = field(default_factory=NetworkConfig)
     loss: LossConfig = field(default_factory=LossConfig)

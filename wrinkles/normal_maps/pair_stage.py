@@ -12,7 +12,6 @@ metrics/000123.json   share of the texels that are known, and the angle between 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -59,7 +58,6 @@ def run(
         InputError: the work folder lacks its registration or its scans' garments, the template has no usable UVs, or
             the pairs to borrow from are of another template or other frames.
     """
-    _check(config)
     if high_from is not None:
         return _borrow(work, high_from, config, overwrite=overwrite)
     upstream = _inputs(work)
@@ -166,21 +164,6 @@ def _pending(stage: Stage, frame_ids: Sequence[int]) -> list[int]:
     """Frames that lack one map or the other."""
     missing = {frame_id for folder in ("low", "high") for frame_id in stage.pending(frame_ids, ".png", folder=folder)}
     return [frame_id for frame_id in frame_ids if frame_id in missing]
-
-
-def _check(config: PairConfig) -> None:
-    for name, value, least in (
-        ("map.size", config.map.size, 1),
-        ("map.padding", config.map.padding, 0),
-        ("projection.border_rings", config.projection.border_rings, 0),
-        ("projection.smoothing_passes", config.projection.smoothing_passes, 0),
-        ("projection.distance_m", config.projection.distance_m, 0),
-        ("projection.angle_deg", config.projection.angle_deg, 0),
-        ("projection.temporal_span_s", config.projection.temporal_span_s, 0),
-        ("projection.blur_texels", config.projection.blur_texels, 0),
-    ):
-        if not (math.isfinite(value) and value >= least):
-            raise InputError(f"{name}: expected a number, at least {least}, found {value:g}")
 
 
 def _length(job: _Run) -> int:

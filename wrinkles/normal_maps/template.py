@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
-from capture4d.errors import InputError
 from capture4d.geometry.mesh import normalised, vertex_normals
 from capture4d.geometry.tangents import TangentLayout, tangent_frames
 from capture4d.geometry.uv_layout import unit_square
@@ -75,8 +74,6 @@ class FramePair:
 
 def temporal_window(frame_ids: Sequence[int], index: int, *, fps: float, config: ProjectionConfig) -> range:
     """Positions of the frames averaged for one: a run around it without gaps, next to each other in time."""
-    if config.temporal_frames % 2 == 0 or config.temporal_frames < 1:
-        raise InputError(f"temporal_frames: expected an odd number, found {config.temporal_frames}")
     reach = config.temporal_frames // 2
 
     def adjoin(a: int, b: int) -> bool:

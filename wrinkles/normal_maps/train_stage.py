@@ -67,7 +67,6 @@ def run(
     Raises:
         InputError: no or differing takes, or a checkpoint of another architecture.
     """
-    _check(config)
     if not works:
         raise InputError("wrinkles train: expected at least one work folder, found none")
     for work in works:
@@ -116,31 +115,6 @@ def learned_takes(model: Path) -> set[str]:
     """Digests of the registrations that a trained network learned from."""
     path = model / TAKES
     return set(read_json(path).values()) if path.is_file() else set()
-
-
-def _check(config: WrinkleConfig) -> None:
-    schedule = config.schedule
-    counts = {
-        "texels": config.texels,
-        "network.filters": config.network.filters,
-        "network.layers": config.network.layers,
-        "schedule.steps": schedule.steps,
-        "schedule.batch": schedule.batch,
-        "schedule.checkpoint_every": schedule.checkpoint_every,
-        "schedule.sample_every": schedule.sample_every,
-        "schedule.log_every": schedule.log_every,
-    }
-    for name, value in counts.items():
-        if value < 1:
-            raise InputError(f"{name}: expected at least 1, found {value}")
-    if config.held_out_gap < 0:
-        raise InputError(f"held_out_gap: expected at least 0, found {config.held_out_gap}")
-    if not schedule.learning_rate > 0:
-        raise InputError(f"schedule.learning_rate: expected a positive rate, found {schedule.learning_rate:g}")
-    if not 0 <= schedule.beta1 < 1:
-        raise InputError(f"schedule.beta1: expected a number from 0 to below 1, found {schedule.beta1:g}")
-    if not 0 <= config.held_out < 1:
-        raise InputError(f"held_out: expected a share from 0 to below 1, found {config.held_out:g}")
 
 
 def score_take(model: WrinkleModel, take: PairTake, mesh: Mesh) -> tuple[MapScores, MapScores]:

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Float16, Int
 from torch import Tensor, nn
 
 from capture4d.body.skinning import pose_frame, with_shape
+from capture4d.settings import Count, NonNegative, Positive, Seed, settings
 from capture4d.types import Body, PoseSequence
 from wrinkles.offset_images.layout import OffsetLayout, OffsetSampler, OffsetSpace, encode
 from wrinkles.offset_images.networks import FullyConnected, ImageDecoder
@@ -34,19 +35,19 @@ __all__ = [
 CM = 100.0
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class OffsetConfig:
     """How the decoder and its baselines learn. Adam at 1e-3; the paper does not say the rest."""
 
-    seed: int = 0
-    epochs: int = 60
-    batch: int = 16
-    learning_rate: float = 1e-3
+    seed: Seed = 0
+    epochs: Count = 60
+    batch: Count = 16
+    learning_rate: Positive = 1e-3
     """Falls to zero along a cosine."""
     norm: Literal["l1", "l2"] = "l2"
     """Of the three channels of a texel, in the grid loss; l2 is not squared."""
-    normal_weight: float = 0.01
-    patience: int = 12
+    normal_weight: NonNegative = 0.01
+    patience: Count = 12
     """Epochs without a better validation error after which training stops."""
     centred: bool = True
     """The decoder learns how images differ from their mean, and the baseline without PCA starts from the mean; the

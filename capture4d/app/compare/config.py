@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Annotated
+
+from capture4d.settings import Count, PowerOfTwo, Range, Whole, settings
 
 __all__ = ["CompareConfig"]
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class CompareConfig:
     """What is compared."""
 
-    held_out: float = 0.2
+    held_out: Annotated[float, Range(above=0, below=1)] = 0.2
     """Share of frames at the end of the take that nothing is learned from here. A network keeps its own split."""
-    gap: int = 10
+    gap: Whole = 10
     """Frames between the two that belong to neither."""
-    pictures: int = 3
+    pictures: Count = 3
     """Held-out frames drawn."""
-    image_texels: int = 256
+    image_texels: Annotated[int, Range(least=16), PowerOfTwo] = 256
     """Side of the offset images."""
-    epochs: int = 30
+    epochs: Count = 30
     """Of the offset networks."""

@@ -126,7 +126,6 @@ def run(
         InputError: the work folder lacks registration or scans, a model is of another template, or the network learned
             from all frames.
     """
-    _check(config)
     weights = model / "generator.safetensors" if model.is_dir() else model
     generator = load_model(weights)
     ensure_pairs(work, PairConfig(map=generator.maps), workers=workers)
@@ -251,16 +250,6 @@ def _garment_model(work: Path, path: Path | None) -> GarmentModel | None:
     if path is None and not (work / "retarget" / "fit.json").is_file():
         return None
     return load_garment_model(work if path is None else path)
-
-
-def _check(config: CompareConfig) -> None:
-    for name, value, least in (("pictures", config.pictures, 1), ("epochs", config.epochs, 1), ("gap", config.gap, 0)):
-        if value < least:
-            raise InputError(f"{name}: expected at least {least}, found {value}")
-    if not 0 < config.held_out < 1:
-        raise InputError(f"held_out: expected a share between 0 and 1, found {config.held_out:g}")
-    if config.image_texels < 16 or config.image_texels & (config.image_texels - 1):
-        raise InputError(f"image_texels: expected a power of two from 16 on, found {config.image_texels}")
 
 
 def _network_split(weights: Path, work: Path, upstream: Mapping[str, str], config: CompareConfig) -> tuple[float, int]:

@@ -39,6 +39,7 @@ from capture4d.evaluation import correspondence_errors, material_points
 from capture4d.files.atomic import read_json, write_bytes, write_json
 from capture4d.runs.stage import StageResult, open_stage, require_complete, result_of
 from capture4d.runs.workers import run_jobs, shared
+from capture4d.settings import Count, settings
 
 __all__ = ["MAX_FLAGGED_ROWS", "ReportConfig", "flat", "is_current", "joined_chart", "run", "shown", "spread"]
 
@@ -86,21 +87,24 @@ class Stages:
     comparison: Comparison | None
 
 
-@dataclass(frozen=True, slots=True)
+@settings
 class ReportConfig:
     """What the report shows."""
 
-    pictures: int = 6
+    pictures: Count = 6
     """Frames drawn, spread over the take; the worst flagged frame comes on top."""
-    stage_pictures: int = 3
+    stage_pictures: Count = 3
     """Frames whose extraction and tracking are drawn."""
-    truth_frames: int = 240
+    truth_frames: Count = 240
     """Frames measured against the truth at most, spread over the take."""
+
+
+DEFAULT = ReportConfig()
 
 
 def run(
     work: WorkFolder,
-    config: ReportConfig = ReportConfig(),
+    config: ReportConfig = DEFAULT,
     *,
     capture: Capture | None = None,
     workers: int = 1,

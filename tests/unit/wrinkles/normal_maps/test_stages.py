@@ -301,15 +301,18 @@ def test_the_newest_checkpoint_is_the_one_with_the_most_steps(work: Path, traine
     ("wrong", "said"),
     [
         (("--texels", "24"), "expected maps of 24 texels times a power of two, found 64"),
-        (("--schedule.log-every", "0"), "schedule.log_every: expected at least 1, found 0"),
+        (("--schedule.log-every", "0"), "--schedule.log-every: expected at least 1, found 0"),
         (("--network.layers", "9"), "network.layers: expected at most 5"),
-        (("--held-out", "1"), "held_out: expected a share from 0 to below 1, found 1"),
-        (("--held-out-gap", "-5"), "held_out_gap: expected at least 0, found -5"),
-        (("--schedule.learning-rate", "-1"), "schedule.learning_rate: expected a positive rate, found -1"),
-        (("--schedule.beta1", "1.5"), "schedule.beta1: expected a number from 0 to below 1, found 1.5"),
+        (("--held-out", "1"), "--held-out: expected from 0 to below 1, found 1"),
+        (("--held-out-gap", "-5"), "--held-out-gap: expected at least 0, found -5"),
+        (("--schedule.learning-rate", "-1"), "--schedule.learning-rate: expected a positive number, found -1"),
+        (("--schedule.beta1", "1.5"), "--schedule.beta1: expected from 0 to below 1, found 1.5"),
         (("--workers", "0"), "--workers: expected at least 1, found 0"),
-        (("--pairs.map.size", "0"), "map.size: expected a number, at least 1, found 0"),
-        (("--pairs.projection.distance-m", "nan"), "projection.distance_m: expected a number, at least 0, found nan"),
+        (("--pairs.map.size", "0"), "--pairs.map.size: expected at least 1, found 0"),
+        (
+            ("--pairs.projection.distance-m", "nan"),
+            "--pairs.projection.distance-m: expected a finite number, found nan",
+        ),
     ],
 )
 def test_settings_out_of_range_leave_nothing_behind(

@@ -188,7 +188,7 @@ def test_a_model_of_another_template_is_refused(compared: Path):
     [
         ("--image-texels", "100", "power of two"),
         ("--epochs", "0", "at least 1"),
-        ("--held-out", "0", "between 0 and 1"),
+        ("--held-out", "0", "above 0, below 1"),
     ],
 )
 def test_settings_out_of_range(compared: Path, capsys: pytest.CaptureFixture[str], option: str, value: str, said: str):

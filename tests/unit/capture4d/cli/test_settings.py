@@ -1,0 +1,89 @@
+"""A setting out of range is one line that names the option as it was typed, before anything is read or made."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from capture4d.cli.main import main
+
+INPUTS = {
+    "register": ("no-capture", "--output", "out"),
+    "run": ("no-capture", "--output", "out"),
+    "synth": ("out",),
+    "scan": ("no-meshes", "out"),
+    "fit": ("no-work",),
+    "animate": ("no-model", "--poses", "no-poses.npz", "--output", "out"),
+    "check": ("no-capture",),
+    "compare": ("no-work", "--model", "no-model"),
+    "convert-poses": ("no.bvh", "out.npz"),
+    "register-mesh": ("no.ply", "no.ply", "--output", "out.ply"),
+}
+SAME = "--coarse.compression 2 --dense.compression"  # two classes, one field name each
+
+
+@pytest.mark.parametrize(
+    ("command", "options", "said"),
+    [
+        ("register", "--graph.nodes -3", "--graph.nodes: expected at least 1, found -3"),
+        ("register", "--graph.nodes=-3", "--graph.nodes: expected at least 1, found -3"),
+        ("register", "--dense.cold.steps -2", "--dense.cold.steps: expected at least 0, found -2"),
+        ("register", "--sequence.segment -5", "--sequence.segment: expected at least 1, found -5"),
+        ("register", "--data.robust-scale 0", "--data.robust-scale: expected a positive number, found 0"),
+        ("register", "--graph.nodes-per-vertex 0", "--graph.nodes-per-vertex: expected at least 1, found 0"),
+        ("register", "--graph.nodes_per_vertex 0", "--graph.nodes_per_vertex: expected at least 1, found 0"),
+        ("register", "--preset paper --coarse.warm.steps -1", "--coarse.warm.steps: expected at least 0, found -1"),
+        ("register", "--coarse.cold.gate 0.1 -0.1", "--coarse.cold.gate: expected a positive number, found -0.1"),
+        ("register", "--coarse.cold.gate 0.1 nan", "--coarse.cold.gate: expected a finite number, found nan"),
+        ("register", f"{SAME} -1", "--dense.compression: expected at least 0, found -1"),
+        ("register", "--workers 0", "--workers: expected at least 1, found 0"),
+        ("run", "--registration.graph.nodes 0", "--registration.graph.nodes: expected at least 1, found 0"),
+        ("run", "--tracking.fit.normal-cosine 2", "--tracking.fit.normal-cosine: expected from -1 to 1, found 2"),
+        ("synth", "--frames 0", "--frames: expected at least 1, found 0"),
+        ("synth", "--capture-every 0", "--capture-every: expected at least 1, found 0"),
+        ("synth", "--simulation.calm-frames 0", "--simulation.calm-frames: expected at least 1, found 0"),
+        ("synth", "--scanner.rig.cameras 3", "--scanner.rig.cameras: expected at least 4, found 3"),
+        ("synth", "--scanner stereo --scanner.stereo.pods 2", "--scanner.stereo.pods: expected at least 4, found 2"),
+        ("synth", "--motion.bvh none.bvh", "none.bvh: no such BVH file"),
+        ("scan", "--step 0", "--step: expected at least 1, found 0"),
+        ("scan", "--fps 0", "--fps: expected a positive number, found 0"),
+        ("scan", "--frames 0", "--frames: expected at least 1, found 0"),
+        ("scan", "--scanner.rig.cameras 3", "--scanner.rig.cameras: expected at least 4, found 3"),
+        ("fit", "--kernel.ridges", "--kernel.ridges: expected at least one value, found none"),
+        ("fit", "--kernel.ridges 1 0", "--kernel.ridges: expected a positive number, found 0"),
+        ("fit", "--kernel.control.history 2", "--kernel.control.history: expected 0, for kernels carry nothing on"),
+        ("animate", "--beta nan", "--beta: expected a finite number, found nan"),
+        ("compare", "--image-texels 48", "--image-texels: expected a power of two, found 48"),
+        ("check", "--workers 0", "--workers: expected at least 1, found 0"),
+        ("check", "--fps -1", "--fps: expected a positive number, found -1"),
+        ("convert-poses", "--fps 0", "--fps: expected a positive number, found 0"),
+        ("register-mesh", "--registration.graph.nodes 0", "--registration.graph.nodes: expected at least 1, found 0"),
+    ],
+)
+def test_one_line_and_nothing_is_written(
+    command: str,
+    options: str,
+    said: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as exit_:
+        main([command, *INPUTS[command], *options.split()])
+    (line,) = capsys.readouterr().err.splitlines()
+    assert exit_.value.code == 1
+    assert line.startswith(f"capture4d: {said}")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_mesh_file_that_cannot_be_written_is_named_first(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as exit_:
+        main(["register-mesh", "a.ply", "b.ply", "--output", "out.stl"])
+    assert exit_.value.code == 1
+    assert "out.stl: expected a mesh file (.obj, .ply, .glb), found '.stl'" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
