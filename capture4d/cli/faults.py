@@ -22,8 +22,8 @@ def check_command(command: Any, faults: Sequence[SettingError], arguments: Seque
     Raises:
         InputError: a setting, or an option of the command's own, is out of range; the message names the option.
     """
-    for fault in faults:
-        raise _renamed(fault, command, arguments)
+    if faults:
+        raise _renamed(faults[0], command, arguments)
     try:
         check_fields(command)
     except SettingError as fault:

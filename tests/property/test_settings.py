@@ -7,7 +7,6 @@ import dataclasses
 import importlib
 import inspect
 import math
-import pkgutil
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from hypothesis import given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
 
-import capture4d.cli
+from capture4d.cli.main import COMMANDS
 from capture4d.settings import Condition, PowerOfTwo, Range, SettingError
 from data_synth.config import TRAINING_SETS, TrainingSetConfig
 from registration.config import DenseConfig, Schedule
@@ -50,15 +49,7 @@ def settings_classes() -> list[type]:
     ]
 
 
-def commands() -> list[type]:
-    """The classes that tyro makes commands from."""
-    names = [f"capture4d.cli.{entry.name}" for entry in pkgutil.iter_modules(capture4d.cli.__path__)]
-    found = (kind for name in names for kind in vars(importlib.import_module(name)).values())
-    return [kind for kind in found if inspect.isclass(kind) and dataclasses.is_dataclass(kind) and callable(kind)]
-
-
 CLASSES = settings_classes()
-COMMANDS = [kind for kind in commands() if "__call__" in vars(kind)]
 
 
 @dataclass(frozen=True)
@@ -167,11 +158,11 @@ def test_what_is_named_as_settings_is_settings():
 
 def test_what_a_command_is_made_from_is_settings():
     assert len(COMMANDS) > 20
-    reached = {kind for command in COMMANDS for kind in dataclasses_in(command)} - set(COMMANDS)
+    reached = {kind for command in COMMANDS.values() for kind in dataclasses_in(command)} - {*COMMANDS.values()}
     assert reached - set(CLASSES) == set()
 
 
-@pytest.mark.parametrize("kind", [*CLASSES, *COMMANDS], ids=lambda kind: f"{kind.__module__}.{kind.__name__}")
+@pytest.mark.parametrize("kind", [*CLASSES, *COMMANDS.values()], ids=lambda kind: f"{kind.__module__}.{kind.__name__}")
 def test_every_number_states_its_range(kind: type):
     silent = [place.field for place in places(kind) if not any(isinstance(rule, Range) for rule in place.rules)]
     assert silent == []
