@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Float64, Int32
 from numba import njit
 
+from capture4d.geometry.point_grid import PointGrid
 from registration.correspondences import ScanSurface
-from registration.point_grid import PointGrid
 
 __all__ = ["edge_faces", "folded_lengths"]
 

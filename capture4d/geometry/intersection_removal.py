@@ -1,4 +1,4 @@
-"""Taking a garment out of the body it is on.
+"""Taking a surface out of a closed one: a garment out of the body it is on.
 
 What is moved is chosen here: vertices behind the body's surface, and, where the body pokes through a face whose corners
 are all outside, those corners. The rest follows by sparse least squares over the displacement d,
@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int32
@@ -23,9 +24,8 @@ from scipy.sparse.linalg import splu
 
 from capture4d.geometry.mesh import vertex_adjacency, vertex_normals
 from capture4d.heavy_imports import import_open3d
-from retarget.config import RemovalConfig
 
-__all__ = ["BodySurface", "IntersectionRemoval", "Penetration", "Removed"]
+__all__ = ["ClosedSurface", "IntersectionRemoval", "Penetration", "RemovalSettings", "Removed"]
 
 EDGE_MIDDLES = np.array([[1, 1, 0], [0, 1, 1], [1, 0, 1], [2 / 3, 2 / 3, 2 / 3]]) / 2
 """Where a face is probed: the middles of its edges, and its own."""
@@ -34,6 +34,35 @@ THINNEST_M, SLACK_M = 0.03, 0.001
 face spans a crease, of an arm against the trunk, and pushing its corners out would blow it up."""
 TOLERANCE, MOST_STEPS = 1e-6, 200
 """Relative residual at which conjugate gradients stop; the preconditioner leaves them a condition of `leave`/`stay`."""
+
+
+@runtime_checkable
+class RemovalSettings(Protocol):
+    """What a stage's own settings have to say."""
+
+    @property
+    def enabled(self) -> bool:
+        """Off, nothing moves, and what is inside is only measured."""
+        ...
+
+    @property
+    def margin_mm(self) -> float:
+        """How far outside vertices are put."""
+        ...
+
+    @property
+    def stay(self) -> float: ...
+
+    @property
+    def leave(self) -> float: ...
+
+    @property
+    def rounds(self) -> int: ...
+
+    @property
+    def faces(self) -> bool:
+        """Also where the closed surface pokes through a face whose corners are all outside."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,8 +83,8 @@ class Penetration:
         return Penetration(100.0 * len(depths) / len(heights_m), float(depths.mean()), float(depths.max()))
 
 
-class BodySurface:
-    """A posed body to measure heights over. Normals are interpolated, so that they do not jump at edges."""
+class ClosedSurface:
+    """A posed body, say, to measure heights over. Normals are interpolated, so that they do not jump at edges."""
 
     def __init__(self, vertices: Float[np.ndarray, "skin 3"], faces: Int32[np.ndarray, "faces 3"]) -> None:
         self._scene = import_open3d().t.geometry.RaycastingScene(nthreads=1)
@@ -96,7 +125,7 @@ class Removed:
 class IntersectionRemoval:
     """The least squares of one topology, factorised once; one call a frame."""
 
-    def __init__(self, faces: Int32[np.ndarray, "faces 3"], count: int, config: RemovalConfig) -> None:
+    def __init__(self, faces: Int32[np.ndarray, "faces 3"], count: int, config: RemovalSettings) -> None:
         self._faces, self._config = faces, config
         adjacency = vertex_adjacency(faces, count).astype(np.float64)
         degree = np.asarray(adjacency.sum(axis=1)).ravel()
@@ -105,7 +134,7 @@ class IntersectionRemoval:
         self._stiffness = (laplacian.T @ laplacian).tocsr()
         self._factor = splu((self._stiffness + config.stay * sparse.eye_array(count)).tocsc())
 
-    def __call__(self, vertices: Float[np.ndarray, "verts 3"], body: BodySurface) -> Removed:
+    def __call__(self, vertices: Float[np.ndarray, "verts 3"], body: ClosedSurface) -> Removed:
         """Move a garment, metres, out of a body."""
         config, margin = self._config, 1e-3 * self._config.margin_mm
         start = vertices.astype(np.float64)
@@ -139,7 +168,7 @@ class IntersectionRemoval:
         points: np.ndarray,
         heights: np.ndarray,
         push: np.ndarray,
-        body: BodySurface,
+        body: ClosedSurface,
         margin: float,
         bulge: np.ndarray,
     ) -> np.ndarray:
