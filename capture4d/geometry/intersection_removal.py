@@ -23,7 +23,7 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from capture4d.geometry.mesh import vertex_adjacency, vertex_normals
-from capture4d.heavy_imports import import_open3d
+from capture4d.geometry.ray_casting import TriangleScene, barycentric
 
 __all__ = ["ClosedSurface", "IntersectionRemoval", "Penetration", "RemovalSettings", "Removed"]
 
@@ -87,21 +87,18 @@ class ClosedSurface:
     """A posed body, say, to measure heights over. Normals are interpolated, so that they do not jump at edges."""
 
     def __init__(self, vertices: Float[np.ndarray, "skin 3"], faces: Int32[np.ndarray, "faces 3"]) -> None:
-        self._scene = import_open3d().t.geometry.RaycastingScene(nthreads=1)
-        self._scene.add_triangles(vertices.astype(np.float32), faces.astype(np.uint32))
+        self._scene = TriangleScene((vertices, faces))
         self._faces, self._normals = faces, vertex_normals(vertices.astype(np.float64), faces)
 
     def heights(
         self, points: Float[np.ndarray, "points 3"]
     ) -> tuple[Float64[np.ndarray, " points"], Float64[np.ndarray, "points 3"]]:
         """Height over the nearest point of the surface, metres, negative inside; and the normal there."""
-        closest = self._scene.compute_closest_points(np.ascontiguousarray(points, np.float32))
-        uv = closest["primitive_uvs"].numpy().astype(np.float64)
-        weights = np.column_stack([1 - uv.sum(axis=1), uv])
-        corners = self._normals[self._faces[closest["primitive_ids"].numpy().astype(np.int64)]]
-        normals = np.einsum("pk,pkx->px", weights, corners)
+        nearest = self._scene.nearest(points)
+        corners = self._normals[self._faces[nearest.faces]]
+        normals = np.einsum("pk,pkx->px", barycentric(nearest.uv.astype(np.float64)), corners)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-        apart = points - closest["points"].numpy().astype(np.float64)
+        apart = points - nearest.points.astype(np.float64)
         return np.linalg.norm(apart, axis=1) * np.sign(np.einsum("px,px->p", apart, normals)), normals
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from capture4d.geometry.mesh import face_areas
-from capture4d.heavy_imports import import_open3d
+from capture4d.geometry.ray_casting import TriangleScene
 from data_synth.cloth.patterns import PanelMesh
 from data_synth.cloth.wrinkle_relaxation import WrinkleMesh
 
@@ -48,9 +48,7 @@ def measure_cloth(
     first, second = mesh.uv[:, 1] - mesh.uv[:, 0], mesh.uv[:, 2] - mesh.uv[:, 0]
     rest_area = 0.5 * np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
     area = face_areas(vertices.astype(np.float64), mesh.faces) / rest_area
-    scene = import_open3d().t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(surface.astype(np.float32), body_faces.astype(np.uint32))
-    depth = -scene.compute_signed_distance(vertices.astype(np.float32)).numpy()
+    depth = -TriangleScene((surface, body_faces)).signed_distances(vertices)
     p1, p99 = np.percentile(stretch, [1, 99])
     crushed, over = int((area < AREA_LIMITS[0]).sum()), int((area > AREA_LIMITS[1]).sum())
     inside = 100 * float((depth > 0).mean())
