@@ -87,9 +87,7 @@ def calibration(capture: Capture, work: Path) -> Calibration | None:
     rig = capture.rig
     if rig is None:
         return None
-    centres = -np.einsum("cba,cb->ca", rig.T_camera_world[:, :3, :3], rig.T_camera_world[:, :3, 3])
-    middle = centres.mean(axis=0)
-    away = np.linalg.norm(centres - middle, axis=1)
+    away = np.linalg.norm(rig.centres - rig.centres.mean(axis=0), axis=1)
     sizes = sorted({(int(width), int(height)) for width, height in rig.image_sizes})
     tiles = [
         (f"{len(rig.names)}", "", "cameras"),
