@@ -19,7 +19,7 @@ import numpy as np
 from rich.console import Console
 
 from benchmarks.metric import Metric
-from capture4d.evaluation import scan_errors
+from benchmarks.scan_errors import scan_errors
 from capture4d.geometry.mesh import vertex_normals
 from capture4d.geometry.triangles import count_intersecting_faces
 from capture4d.runs.workers import run_jobs

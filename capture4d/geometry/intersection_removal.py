@@ -71,16 +71,13 @@ class Penetration:
 
     inside_percent: float
     """Vertices behind the surface."""
-    depth_mean_mm: float
-    """Of those; 0 if there are none."""
     depth_max_mm: float
+    """Of the deepest; 0 if there are none."""
 
     @staticmethod
     def of(heights_m: Float[np.ndarray, " verts"]) -> Penetration:
         depths = -1e3 * heights_m[heights_m < 0]
-        if not len(depths):
-            return Penetration(0.0, 0.0, 0.0)
-        return Penetration(100.0 * len(depths) / len(heights_m), float(depths.mean()), float(depths.max()))
+        return Penetration(100.0 * len(depths) / max(len(heights_m), 1), float(depths.max(initial=0.0)))
 
 
 class ClosedSurface:

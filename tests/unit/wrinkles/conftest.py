@@ -67,6 +67,11 @@ def wrinkle_normals(points: np.ndarray, height_m: float = 0.002, phase: float = 
     return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
 
+def from_tangent(normals: np.ndarray, frames: np.ndarray) -> np.ndarray:
+    """Tangent-space normals (N, 3) in global coordinates; frames (N, 3, 3) have rows tangent, bitangent, normal."""
+    return np.einsum("nrc,nr->nc", frames, normals)
+
+
 def some_scan(*, height_m: float = 0.002, noise_m: float = 0.0, phase: float = 0.0, seed: int = 0) -> Mesh:
     """A fine sleeve with waves along it."""
     fine = sleeve(200, 170)

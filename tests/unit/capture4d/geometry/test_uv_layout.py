@@ -1,5 +1,7 @@
 """Patterns in metres come to lie in the unit square: whole, apart, and at one scale."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -59,7 +61,7 @@ def test_boxes_stand_on_shelves_apart_and_the_tall_ones_first():
         for other in range(one):
             assert (low[one] >= high[other] - 1e-12).any() or (low[other] >= high[one] - 1e-12).any()
     levels = [sizes[low[:, 1] == level, 1] for level in np.unique(low[:, 1])]
-    assert all(above.max() <= below.min() for below, above in zip(levels, levels[1:], strict=False))
+    assert all(above.max() <= below.min() for below, above in itertools.pairwise(levels))
     np.testing.assert_array_equal(shelve(np.array([[3.0, 1.0], [2.0, 2.0]]), 1.0), [[0, 2], [0, 0]])
 
 

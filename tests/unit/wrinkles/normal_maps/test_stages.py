@@ -22,11 +22,18 @@ from capture4d.files.records import load_garment, save_garment
 from capture4d.geometry.mesh import submesh
 from capture4d.runs.stage import open_stage
 from capture4d.types import Garment, Mesh
-from tests.unit.wrinkles.conftest import make_work, outside_the_unit_square, some_garment, some_scan, wrinkle_normals
+from tests.unit.wrinkles.conftest import (
+    from_tangent,
+    make_work,
+    outside_the_unit_square,
+    some_garment,
+    some_scan,
+    wrinkle_normals,
+)
 from wrinkles.normal_maps import train_stage
 from wrinkles.normal_maps.config import MapConfig
 from wrinkles.normal_maps.display import fill_holes
-from wrinkles.normal_maps.spaces import decode_png, encode_png, from_tangent
+from wrinkles.normal_maps.spaces import decode_png, encode_png
 from wrinkles.normal_maps.template import MapTemplate
 
 SMALL = ["--pairs.map.size", "64", "--texels", "32", "--network.filters", "4", "--network.layers", "5",
