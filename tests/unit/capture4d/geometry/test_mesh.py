@@ -19,19 +19,12 @@ from capture4d.geometry.mesh import (
     vertex_normals,
 )
 from capture4d.types import Mesh
+from tests import shapes
 
 
-def tube(around: int = 12, along: int = 5, radius: float = 0.5) -> Mesh:
-    """An open cylinder about Z, wound outwards: two border loops of `around` vertices."""
-    angle = 2 * np.pi * np.arange(around) / around
-    ring = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
-    vertices = np.concatenate([np.column_stack([ring, np.full(around, z)]) for z in np.linspace(0, 1, along)])
-    column, row = np.meshgrid(np.arange(around), np.arange(along - 1))
-    a, b = row * around + column, row * around + (column + 1) % around
-    faces = np.concatenate(
-        [np.stack([a, b, b + around], -1).reshape(-1, 3), np.stack([a, b + around, a + around], -1).reshape(-1, 3)]
-    )
-    return Mesh(vertices.astype(np.float32), faces.astype(np.int32))
+def tube(around: int = 12, along: int = 5) -> Mesh:
+    """An open cylinder, 1 across and 1 high: two border loops of `around` vertices."""
+    return shapes.tube(around, along, 0.5, 1.0)
 
 
 def test_area_vectors_are_as_long_as_twice_the_area_and_point_outwards():
@@ -39,13 +32,13 @@ def test_area_vectors_are_as_long_as_twice_the_area_and_point_outwards():
     normals = doubled_area_vectors(mesh.vertices, mesh.faces)
     centres = mesh.vertices[mesh.faces].mean(axis=1)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 2 * face_areas(mesh.vertices, mesh.faces), rtol=1e-6)
-    assert (np.einsum("fd,fd->f", normals[:, :2], centres[:, :2]) > 0).all()
+    assert (np.einsum("fd,fd->f", normals, centres * [1, 0, 1]) > 0).all()
 
 
 def test_vertex_normals_of_a_tube_are_radial_away_from_its_borders():
     mesh = tube(around=64, along=9)
     inner = slice(64, -64)
-    radial = mesh.vertices[inner] * [1, 1, 0] / 0.5
+    radial = mesh.vertices[inner] * [1, 0, 1] / 0.5
     np.testing.assert_allclose(vertex_normals(mesh.vertices, mesh.faces)[inner], radial, atol=2e-3)
 
 
