@@ -16,12 +16,12 @@ def run(*arguments: str | Path) -> int:
     return int(exit_.value.code or 0)
 
 
-def fails(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
-    """Run a command that must fail on its input; what the one line it ends with says of the fault."""
+def fails(capsys: pytest.CaptureFixture[str], *arguments: str | Path, code: int = 1) -> str:
+    """Run a command that must fail, on its input if the code is 1; what the one line it ends with says of the fault."""
     capsys.readouterr()
-    code = run(*arguments)
+    given = run(*arguments)
     said = capsys.readouterr().err.strip()
-    assert code == 1, said
+    assert given == code, said
     assert "Traceback" not in said
     *progress, line = said.splitlines()
     assert all(" left " in each for each in progress), said

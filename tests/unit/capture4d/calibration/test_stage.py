@@ -79,7 +79,7 @@ def test_a_rig_is_calibrated_from_images(shoot):
 def test_an_untouched_rig_passes_the_check_and_a_turned_camera_does_not(shoot, capsys: pytest.CaptureFixture[str]):
     folder, truth, _ = shoot
     assert run("check-rig", folder / "rig.json", folder / "still", "--workers", "1") == 0
-    line = fails(capsys, "check-rig", folder / "rig.json", folder / "turned", "--workers", "1")
+    line = fails(capsys, "check-rig", folder / "rig.json", folder / "turned", "--workers", "1", code=3)
     assert line == f"moved since calibration: {truth.names[1]}"
 
 
