@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from capture4d.body.skinning import PosedBody
-from capture4d.geometry.mesh import face_areas, face_normals, vertex_normals
+from capture4d.geometry.mesh import doubled_area_vectors, face_areas, normalised, vertex_normals
 from capture4d.tracking.scan_points import ScanPoints
 from capture4d.types import Body, Mesh
 
@@ -87,7 +87,7 @@ def sample_scan(
         root, across = np.sqrt(rng.random(count)), rng.random(count)
         weights = np.stack([1 - root, root * (1 - across), root * across], axis=1)
         corners = mesh.vertices[mesh.faces[face]].astype(np.float64)
-        normals = face_normals(mesh.vertices.astype(np.float64), mesh.faces)[face]
+        normals = normalised(doubled_area_vectors(mesh.vertices.astype(np.float64), mesh.faces))[face]
         parts.append(((corners * weights[:, :, None]).sum(axis=1), normals, np.full(count, cloth)))
     places, normals, cloth = (np.concatenate(each) for each in zip(*parts, strict=True))
     places = places + noise_m * rng.standard_normal(places.shape)

@@ -27,8 +27,8 @@ from capture4d.captures.truth import read_truth_frame, read_truth_model
 from capture4d.captures.work_folder import load_registration
 from capture4d.files.records import load_poses, load_rig
 from capture4d.geometry.mesh import normalised, vertex_normals
+from capture4d.geometry.ray_casting import TriangleScene, barycentric
 from capture4d.geometry.uv_layout import millimetres_per_texel
-from capture4d.heavy_imports import import_open3d
 from capture4d.types import Mesh
 from data_synth.config import PRESETS
 from wrinkles.normal_maps.config import PairConfig
@@ -143,22 +143,17 @@ def _measure(capture_folder: Path, work: Path, frames: int) -> tuple[list[tuple[
 
 def _normals_at(surface: Mesh, normals: np.ndarray, points: np.ndarray, along: np.ndarray) -> np.ndarray:
     """Normals of a surface where lines through some points first meet it, at most REACH_M away; or nearest to them."""
-    scene = import_open3d().t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(surface.vertices.astype(np.float32), surface.faces.astype(np.uint32))
-    answer = scene.compute_closest_points(points.astype(np.float32), nthreads=1)
-    face, uv = answer["primitive_ids"].numpy().astype(np.int64), answer["primitive_uvs"].numpy()
+    scene = TriangleScene((surface.vertices, surface.faces))
+    found = scene.nearest(points)
+    face, uv = found.faces, found.uv
     nearest = np.full(len(points), REACH_M)
     for direction in (along, -along):
-        hit = scene.cast_rays(np.concatenate([points, direction], axis=1).astype(np.float32), nthreads=1)
-        distance, hit_face = hit["t_hit"].numpy(), hit["primitive_ids"].numpy().astype(np.int64)
+        hits = scene.cast(np.concatenate([points, direction], axis=1))
         facing = np.zeros(len(points), bool)
-        met = np.flatnonzero(distance < nearest)
-        facing[met] = (normals[surface.faces[hit_face[met]]].sum(axis=1) * along[met]).sum(axis=1) > 0
-        face[facing], uv[facing], nearest[facing] = (
-            hit_face[facing], hit["primitive_uvs"].numpy()[facing], distance[facing]
-        )  # fmt: skip
-    weights = np.column_stack([1 - uv.sum(axis=1), uv])
-    return normalised(np.einsum("nk,nkc->nc", weights, normals[surface.faces[face]]))
+        met = np.flatnonzero(hits.distance < nearest)
+        facing[met] = (normals[surface.faces[hits.faces[met]]].sum(axis=1) * along[met]).sum(axis=1) > 0
+        face[facing], uv[facing], nearest[facing] = hits.faces[facing], hits.uv[facing], hits.distance[facing]
+    return normalised(np.einsum("nk,nkc->nc", barycentric(uv), normals[surface.faces[face]]))
 
 
 def _row(template: MapTemplate, pair: FramePair, truth: np.ndarray, seen: np.ndarray, slid_m: np.ndarray) -> _Row:
@@ -188,17 +183,14 @@ def _seen(
     rig, body = load_rig(capture.path / "rig.json"), capture.body
     poses = load_poses(capture.path / "truth" / "poses.npz")
     assert body is not None
-    posed = pose_frame(with_shape(body, poses.shape), poses, poses.frame_ids.tolist().index(frame_id)).vertices()
-    scene = import_open3d().t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(cloth.astype(np.float32), faces.astype(np.uint32))
-    scene.add_triangles(posed.astype(np.float32), body.template.faces.astype(np.uint32))
+    posed = pose_frame(with_shape(body, poses.shape), poses, poses.row(frame_id)).vertices()
+    scene = TriangleScene((cloth, faces), (posed, body.template.faces))
     asked = np.arange(0, len(points), RAY_STEP)
     seen = np.zeros(len(points), bool)
     for centre in rig.centres:
         origins = points[asked] + 5e-4 * normals[asked]
         towards = centre - origins
         facing = (towards * normals[asked]).sum(axis=1) > 0
-        rays = np.concatenate([origins[facing], towards[facing]], axis=1).astype(np.float32)
-        free = ~scene.test_occlusions(rays, tfar=1.0, nthreads=1).numpy()
+        free = ~scene.is_met(np.concatenate([origins[facing], towards[facing]], axis=1), far=1.0)
         seen[asked[facing]] |= free
     return seen

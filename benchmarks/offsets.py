@@ -22,9 +22,10 @@ from benchmarks.registered_work import QUICK_TAKE, registered_work
 from capture4d.body.skinning import with_shape
 from capture4d.captures.work_folder import load_moving_body, load_records, load_registration
 from capture4d.errors import InputError
+from capture4d.learning.networks import ImageDecoder
 from retarget.shapes.pose_normalisation import PoseRows
 from wrinkles.offset_images.layout import OffsetLayout, OffsetSampler
-from wrinkles.offset_images.networks import FullyConnected, ImageDecoder, PcaFullyConnected
+from wrinkles.offset_images.networks import FullyConnected, PcaFullyConnected
 from wrinkles.offset_images.training import (
     OffsetConfig,
     OffsetFrames,

@@ -40,9 +40,9 @@ from capture4d.files.meshes import read_mesh
 from capture4d.geometry.closest_points import surface_distances
 from capture4d.types import Garment, GarmentScan, Mesh
 from registration.config import PAPER, MeshRegistrationConfig, RegistrationConfig
+from registration.predictions import Mover
 from registration.register import prepare_frame, register_frame
 from registration.register_mesh import register_mesh
-from registration.sequence import Mover
 from registration.stage import run as register
 from registration.template import analyse_template
 

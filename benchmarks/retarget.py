@@ -18,11 +18,11 @@ from benchmarks.metric import Metric
 from capture4d.body.skinning import ShapedBody
 from capture4d.captures.capture import read_capture
 from capture4d.evaluation import correspondence_errors
+from capture4d.geometry.intersection_removal import Removed
 from capture4d.types import BlendshapeModel, PoseSequence, RegisteredSequence
 from data_synth.config import TrainingSetConfig
 from retarget.animation.animator import AnimatedFrame, Animator
 from retarget.animation.bodies import retargeted_mean
-from retarget.animation.intersections import Removed
 from retarget.config import AnimateConfig, RemovalConfig, ShapeConfig
 from retarget.regression.learning import learn_shapes
 from retarget.shapes.blendshapes import ShapeSpace, as_model_arrays, project

@@ -19,8 +19,9 @@ import numpy as np
 from rich.console import Console
 
 from benchmarks.metric import Metric
-from capture4d.evaluation import scan_errors
+from benchmarks.scan_errors import scan_errors
 from capture4d.geometry.mesh import vertex_normals
+from capture4d.geometry.triangles import count_intersecting_faces
 from capture4d.runs.workers import run_jobs
 from capture4d.types import Mesh
 from data_synth.cloth.patterns import locate
@@ -31,7 +32,6 @@ from data_synth.config import FABRICS, PRESETS, SynthConfig
 from data_synth.scanner.scan import LABEL_BODY, scan_surfaces
 from data_synth.stage import run as synthesise
 from data_synth.take import Take, prepare_take, simulate_take, take_rig, take_surfaces
-from registration.quality import count_intersecting_faces
 
 OVERHEAD_COSINE = 0.5
 """An upper arm that points up steeper than this is overhead."""

@@ -6,31 +6,25 @@ Everything here takes and returns arrays in metres and degrees; whoever prints t
     correspondence error  registered vertex to the true place of the same material point
     drift                 change of the correspondence error over the frames
     border error          the template's border to the true border curve, and back
-    scan accuracy, normal error, holes    a scan against the surface it was made from
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32, Integer
-from scipy.spatial import KDTree
 
-from capture4d.geometry.closest_points import closest_points, surface_distances
-from capture4d.geometry.mesh import face_areas, vertex_normals
+from capture4d.geometry.closest_points import surface_distances
 from capture4d.types import Mesh
 
 __all__ = [
-    "ScanErrors",
     "border_errors",
     "correspondence_errors",
     "curve_distances",
     "drift_per_frame",
     "drift_ratio",
     "material_points",
-    "scan_errors",
     "truth_distances",
 ]
 
@@ -101,40 +95,3 @@ def border_errors(
         if name in found:
             errors += [curve_distances(found[name], curve), curve_distances(curve, found[name])]
     return np.concatenate(errors)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ScanErrors:
-    """A scan of a sheet against the sheet."""
-
-    distance_m: Float64[np.ndarray, " verts"]
-    """Scan vertex to the true surface."""
-    normal_deg: Float64[np.ndarray, " verts"]
-    """Angle between the scan's and the true normal, of the side that was scanned."""
-    hole_share: float
-    """Part of the true area that has no scan vertex within the gate."""
-
-
-def scan_errors(scan: Mesh, truth: Mesh, *, hole_gate_m: float = 0.004, samples: int = 50_000) -> ScanErrors:
-    """Measure the scan of an open sheet, which may show either side of it.
-
-    Args:
-        scan: the part of the scan that shows the sheet, without a change of its own borders.
-        hole_gate_m: farther than this from every scan vertex, the true surface counts as not scanned.
-    """
-    points, faces, barycentric = closest_points(truth, scan.vertices)
-    normals = vertex_normals(truth.vertices, truth.faces)
-    expected = np.einsum("vc,vcx->vx", barycentric, normals[truth.faces[faces]])
-    expected /= np.maximum(np.linalg.norm(expected, axis=1, keepdims=True), 1e-12)
-    cosine = np.einsum("vx,vx->v", vertex_normals(scan.vertices, scan.faces), expected)
-    areas = face_areas(truth.vertices, truth.faces).astype(float)
-    rng = np.random.default_rng(0)
-    chosen = rng.choice(len(areas), samples, p=areas / areas.sum())
-    weights = rng.dirichlet((1, 1, 1), samples)
-    on_truth = np.einsum("vc,vcx->vx", weights, truth.vertices[truth.faces[chosen]])
-    nearest, _ = KDTree(scan.vertices).query(on_truth)
-    return ScanErrors(
-        distance_m=np.linalg.norm(points.astype(float) - scan.vertices, axis=1),
-        normal_deg=np.degrees(np.arccos(np.clip(np.abs(cosine.astype(float)), 0, 1))),
-        hole_share=float((nearest > hole_gate_m).mean()),
-    )

@@ -212,6 +212,18 @@ class PoseSequence:
         if len(np.unique(self.frame_ids)) != frames:
             raise InputError("PoseSequence.frame_ids: expected every frame once, found duplicates")
 
+    def row(self, frame_id: int) -> int:
+        """Where a frame's pose is.
+
+        Raises:
+            InputError: the motion has no such frame.
+        """
+        rows = np.flatnonzero(self.frame_ids == frame_id)
+        if not len(rows):
+            span = f"frames {self.frame_ids[0]} to {self.frame_ids[-1]}" if len(self.frame_ids) else "no frames"
+            raise InputError(f"expected a pose for frame {frame_id}, found {span}")
+        return int(rows[0])
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Garment:

@@ -34,7 +34,7 @@ from data_synth.scanner.config import ScanConfig
 from data_synth.scanner.rig import bounding_sphere, scanner_rig
 from data_synth.scanner.scan import LABEL_GARMENT, Surface, scan_surfaces
 
-__all__ = ["run"]
+__all__ = ["paint_like", "run"]
 
 SCHEMA = 2
 MODEL = "truth/model.npz"
@@ -233,10 +233,10 @@ def _decimated(mesh: Mesh, vertices: int) -> Mesh:
 
 @cache
 def _painted(source: _Source) -> PaintedSheet:
-    return _paint(_first(source), _first(source), source.config)
+    return paint_like(_first(source), _first(source), source.config)
 
 
-def _paint(mesh: Mesh, first: Mesh, config: ScanConfig) -> PaintedSheet:
+def paint_like(mesh: Mesh, first: Mesh, config: ScanConfig) -> PaintedSheet:
     """Paint each border as the one of the first mesh that it is: which is the longest may change with the faces."""
     colours = [parse_colour(text) for text in config.border_colours]
     return paint_borders(
@@ -265,7 +265,7 @@ def _scan_frame(stage: Stage, source: _Source, same_topology: bool, frame_id: in
     """Scan one mesh; truth first, for the frame counts as done once its scan is there."""
     config = source.config
     mesh = source.mesh(frame_id)
-    sheet = _painted(source) if same_topology else _paint(mesh, _first(source), config)
+    sheet = _painted(source) if same_topology else paint_like(mesh, _first(source), config)
     surface = Surface(
         sheet.posed(mesh.vertices), sheet.colours, LABEL_GARMENT, config.scanner.fusion.garment_voxel_m, sheet.painted
     )

@@ -252,7 +252,7 @@ class MeshRegistrationConfig:
 
     boundary_colour: str = ""
     """Paint on the scan's borders, RRGGBB; empty where none is painted."""
-    units: Literal["m", "cm", "mm", "auto"] = "auto"
+    units: Literal["m", "cm", "mm", "in", "auto"] = "auto"
     """Of both files; decides the millimetres of the report, never the result. auto: metres if the template's bounding
     box is less than 8 across, centimetres if less than 200, else millimetres."""
     align: Literal["none", "rigid", "similarity"] = "none"

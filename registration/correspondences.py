@@ -15,7 +15,7 @@ from scipy import sparse
 from scipy.spatial import KDTree
 
 from capture4d.geometry.mesh_kernels import laplacian_pass, mean_edge_length, open_vertices, vertex_normals_kernel
-from registration.point_grid import PointGrid
+from capture4d.geometry.point_grid import PointGrid
 
 __all__ = ["Matches", "ScanSurface", "match", "match_both_ways", "mesh_normals", "prepare_scan"]
 

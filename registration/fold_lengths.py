@@ -17,8 +17,9 @@ import numpy as np
 from jaxtyping import Float64, Int32
 from numba import njit
 
+from capture4d.geometry.mesh import edges_of_faces
+from capture4d.geometry.point_grid import PointGrid
 from registration.correspondences import ScanSurface
-from registration.point_grid import PointGrid
 
 __all__ = ["edge_faces", "folded_lengths"]
 
@@ -40,9 +41,7 @@ def edge_faces(
     Args:
         edges: unique and in ascending order, as `capture4d.geometry.mesh.unique_edges` returns them.
     """
-    count = int(faces.max()) + 1
-    sides = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).astype(np.int64), axis=1)
-    edge = np.searchsorted(edges[:, 0].astype(np.int64) * count + edges[:, 1], sides[:, 0] * count + sides[:, 1])
+    edge = edges_of_faces(faces, edges).reshape(-1)
     order = np.argsort(edge, kind="stable")
     first = np.searchsorted(edge[order], np.arange(len(edges)))
     last = np.searchsorted(edge[order], np.arange(len(edges)), side="right") - 1

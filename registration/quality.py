@@ -17,17 +17,17 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float64
-from numba import njit
 from scipy.spatial import KDTree
 
+from capture4d.geometry.point_grid import PointGrid
+from capture4d.geometry.triangles import count_intersecting_faces, fan_distances
 from registration.config import QualityConfig
 from registration.correspondences import mesh_normals
 from registration.energies import edge_vectors
-from registration.point_grid import PointGrid
 from registration.register import FrameScan
 from registration.template import TemplateAnalysis
 
-__all__ = ["FrameQuality", "assess", "border_distances", "count_intersecting_faces"]
+__all__ = ["FrameQuality", "assess", "border_distances"]
 
 Verdict = Literal["good", "check", "failed"]
 
@@ -175,16 +175,6 @@ def _points_to_template(points: np.ndarray, vertices: np.ndarray, analysis: Temp
     return fan_distances(points, nearest, vertices, analysis.faces, analysis.fan_offsets, analysis.fan_faces)
 
 
-def count_intersecting_faces(vertices: Float64[np.ndarray, "verts 3"], faces: np.ndarray) -> int:
-    """Faces that cut another face they share no vertex with."""
-    corners = vertices[faces]
-    centre = corners.mean(axis=1)
-    reach = np.sqrt(((corners - centre[:, None]) ** 2).sum(axis=2).max(axis=1))
-    radius = 2.0 * float(np.percentile(reach, 99))
-    pairs = KDTree(centre, balanced_tree=False).query_pairs(radius, output_type="ndarray")
-    return int(intersecting_faces(vertices, faces, pairs).sum())
-
-
 def _judge(
     numbers: Mapping[str, float], faces: int, config: QualityConfig, length_factor: float
 ) -> tuple[Verdict, tuple[str, ...]]:
@@ -222,108 +212,3 @@ def _mean(values: np.ndarray) -> float:
 
 def _percentile(values: np.ndarray, percent: float) -> float:
     return float(np.percentile(values, percent)) if len(values) else float("nan")
-
-
-@njit(cache=True, inline="always")
-def dot3(u, v):
-    return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
-
-
-@njit(cache=True, inline="always")
-def difference3(points, p, q):
-    return points[p, 0] - points[q, 0], points[p, 1] - points[q, 1], points[p, 2] - points[q, 2]
-
-
-@njit(cache=True, inline="always")
-def along3(u, s, v, t):
-    return u[0] * s + v[0] * t, u[1] * s + v[1] * t, u[2] * s + v[2] * t
-
-
-@njit(cache=True)
-def triangle_distance(ap, ab, ac):
-    """Distance of a point to a triangle, both given from its corner a (Ericson 2005, closest point on a triangle)."""
-    d1, d2 = dot3(ab, ap), dot3(ac, ap)
-    bb, bc, cc = dot3(ab, ab), dot3(ab, ac), dot3(ac, ac)
-    d3, d4, d5, d6 = d1 - bb, d2 - bc, d1 - bc, d2 - cc
-    va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
-    if d1 <= 0 and d2 <= 0:
-        closest = along3(ab, 0.0, ac, 0.0)
-    elif d3 >= 0 and d4 <= d3:
-        closest = ab
-    elif d6 >= 0 and d5 <= d6:
-        closest = ac
-    elif vc <= 0 and d1 >= 0 and d3 <= 0:
-        closest = along3(ab, d1 / (d1 - d3), ac, 0.0)
-    elif vb <= 0 and d2 >= 0 and d6 <= 0:
-        closest = along3(ab, 0.0, ac, d2 / (d2 - d6))
-    elif va <= 0 and d4 - d3 >= 0 and d5 - d6 >= 0:
-        share = (d4 - d3) / ((d4 - d3) + (d5 - d6))
-        closest = along3(ab, 1.0 - share, ac, share)
-    else:
-        closest = along3(ab, vb / (va + vb + vc), ac, vc / (va + vb + vc))
-    apart = along3(ap, 1.0, closest, -1.0)
-    return np.sqrt(dot3(apart, apart))
-
-
-@njit(cache=True)
-def fan_distances(points, nearest, vertices, faces, fan_offsets, fan_faces):
-    """Distance of each point to the faces around one vertex."""
-    result = np.full(len(points), np.inf)
-    for n in range(len(points)):
-        for entry in range(fan_offsets[nearest[n]], fan_offsets[nearest[n] + 1]):
-            a, b, c = faces[fan_faces[entry], 0], faces[fan_faces[entry], 1], faces[fan_faces[entry], 2]
-            ap = points[n, 0] - vertices[a, 0], points[n, 1] - vertices[a, 1], points[n, 2] - vertices[a, 2]
-            distance = triangle_distance(ap, difference3(vertices, b, a), difference3(vertices, c, a))
-            result[n] = min(result[n], distance)
-    return result
-
-
-@njit(cache=True)
-def segment_cuts(vertices, start, end, a, b, c):
-    """Whether the segment between two vertices passes through a triangle (Moeller and Trumbore 1997)."""
-    d, e1, e2 = difference3(vertices, end, start), difference3(vertices, b, a), difference3(vertices, c, a)
-    s = difference3(vertices, start, a)
-    p = d[1] * e2[2] - d[2] * e2[1], d[2] * e2[0] - d[0] * e2[2], d[0] * e2[1] - d[1] * e2[0]
-    det = dot3(e1, p)
-    if abs(det) < 1e-18:
-        return False
-    u = dot3(s, p) / det
-    if u < 0.0 or u > 1.0:
-        return False
-    q = s[1] * e1[2] - s[2] * e1[1], s[2] * e1[0] - s[0] * e1[2], s[0] * e1[1] - s[1] * e1[0]
-    v = dot3(d, q) / det
-    if v < 0.0 or u + v > 1.0:
-        return False
-    return 0.0 <= dot3(e2, q) / det <= 1.0
-
-
-@njit(cache=True)
-def intersecting_faces(vertices, faces, pairs):
-    """Marks the faces of those pairs that cut each other and share no vertex."""
-    cut = np.zeros(len(faces), np.bool_)
-    for n in range(len(pairs)):
-        f, g = faces[pairs[n, 0]], faces[pairs[n, 1]]
-        apart = False
-        for axis in range(3):
-            low_f = min(vertices[f[0], axis], vertices[f[1], axis], vertices[f[2], axis])
-            high_f = max(vertices[f[0], axis], vertices[f[1], axis], vertices[f[2], axis])
-            low_g = min(vertices[g[0], axis], vertices[g[1], axis], vertices[g[2], axis])
-            high_g = max(vertices[g[0], axis], vertices[g[1], axis], vertices[g[2], axis])
-            if low_f > high_g or low_g > high_f:
-                apart = True
-                break
-        for i in range(3):
-            for j in range(3):
-                if f[i] == g[j]:
-                    apart = True
-        if apart:
-            continue
-        for i in range(3):
-            j = (i + 1) % 3
-            if segment_cuts(vertices, f[i], f[j], g[0], g[1], g[2]) or (
-                segment_cuts(vertices, g[i], g[j], f[0], f[1], f[2])
-            ):
-                cut[pairs[n, 0]] = True
-                cut[pairs[n, 1]] = True
-                break
-    return cut

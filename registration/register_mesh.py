@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from capture4d.files.atomic import write_json
 from capture4d.files.meshes import MESH_SUFFIXES, read_mesh, write_mesh
 from capture4d.geometry.mesh import boundary_loops, submesh
 from capture4d.types import Garment, GarmentScan, Mesh
+from capture4d.units import METRES, Units
 from registration.alignment import Similarity, align
 from registration.config import MeshRegistrationConfig
 from registration.quality import FrameQuality, assess
@@ -36,7 +37,6 @@ DIAGONAL = 1.2
 """Diagonal of the template's bounding box while it is registered, metres: a shirt's."""
 CM_BELOW = 200.0
 """Diagonals from 8 to here are taken for centimetres: a shirt's is 90 to 140 cm, and a hand's 200 mm."""
-METRES: Mapping[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,7 +147,7 @@ def register_mesh(
     )
 
 
-def guess_units(mesh: Mesh) -> str:
+def guess_units(mesh: Mesh) -> Units:
     """m, cm or mm, from the diagonal of the bounding box, for things between a hand and a garment."""
     size = _diagonal(mesh.vertices)
     return "m" if size < 8.0 else "cm" if size < CM_BELOW else "mm"

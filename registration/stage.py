@@ -35,7 +35,8 @@ from capture4d.files.records import save_garment
 from capture4d.runs.stage import Stage, StageResult, open_stage, require_complete
 from capture4d.runs.workers import run_jobs, shared
 from registration.config import RegistrationConfig
-from registration.sequence import FrameResult, Mover, register_run, segments
+from registration.predictions import Mover
+from registration.sequence import FrameResult, register_run, segments
 from registration.template import TemplateAnalysis, analyse_template
 
 __all__ = ["run"]

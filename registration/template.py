@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64, Int32
 
 from capture4d.errors import InputError
-from capture4d.geometry.mesh import unique_edges
+from capture4d.geometry.mesh import edge_uses, edges_of_faces, unique_edges
 from capture4d.types import Garment, Mesh
 from registration.config import RegistrationConfig
 from registration.deformation_graph import DeformationGraph, build_graph
@@ -128,12 +128,9 @@ def rest_lengths(template: Mesh, edges: Int32[np.ndarray, "edges 2"]) -> Float64
     on_mesh = np.linalg.norm(vertices[edges[:, 1]] - vertices[edges[:, 0]], axis=1)
     if template.uv is None:
         return on_mesh
-    corners = np.array([[0, 1], [1, 2], [2, 0]])
     uv = template.uv.astype(np.float64)
-    lengths = np.linalg.norm(uv[:, corners[:, 0]] - uv[:, corners[:, 1]], axis=2).reshape(-1)
-    pairs = np.sort(faces[:, corners].reshape(-1, 2), axis=1).astype(np.int64)
-    count = len(vertices)
-    edge_of = np.searchsorted(edges[:, 0].astype(np.int64) * count + edges[:, 1], pairs[:, 0] * count + pairs[:, 1])
+    lengths = np.linalg.norm(uv - uv[:, [1, 2, 0]], axis=2).reshape(-1)
+    edge_of = edges_of_faces(faces, edges).reshape(-1)
     on_pattern = np.bincount(edge_of, lengths) / np.bincount(edge_of)
     ratio = on_pattern / np.maximum(on_mesh, 1e-12)
     alike = (ratio > PATTERN_RATIO[0]) & (ratio < PATTERN_RATIO[1])
@@ -169,10 +166,7 @@ def _rows(columns: list[np.ndarray], signs: list[float]) -> Rows:
 
 
 def _laplacian_rows(edges: np.ndarray, faces: np.ndarray, count: int) -> Rows:
-    corners = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    keys = np.sort(corners, axis=1).astype(np.int64) @ np.array([1 << 32, 1])
-    _, uses = np.unique(keys, return_counts=True)
-    on_border = uses == 1
+    on_border = edge_uses(faces)[1] == 1
     border_vertex = np.zeros(count, bool)
     border_vertex[edges[on_border].reshape(-1)] = True
     both = np.concatenate([edges, edges[:, ::-1]])

@@ -44,16 +44,14 @@ def tube_capture(tmp_path: Path) -> Path:
     from capture4d.files.records import save_garment
     from capture4d.geometry.mesh import boundary_loops
     from capture4d.types import Garment, Mesh, Scan
+    from tests.shapes import tube_faces
 
     def tube(around: int, along: int, bend_m: float) -> Mesh:
         angle = np.tile(2 * np.pi * np.arange(around) / around, along)
         height = np.repeat(np.linspace(0, 0.6, along), around)
         shift = bend_m * (height / 0.6) ** 2
         vertices = np.stack([0.15 * np.sin(angle) + shift, height, 0.15 * np.cos(angle)], axis=1)
-        row, column = np.divmod(np.arange(around * (along - 1)), around)
-        a, b = row * around + column, row * around + (column + 1) % around
-        faces = np.concatenate([np.stack([a, b, b + around], 1), np.stack([a, b + around, a + around], 1)])
-        return Mesh(vertices.astype(np.float32), faces.astype(np.int32))
+        return Mesh(vertices.astype(np.float32), tube_faces(around, along))
 
     folder = tmp_path / "capture"
     paint = {"neck": (255, 210, 0), "hem": (255, 210, 0)}

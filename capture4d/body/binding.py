@@ -15,7 +15,7 @@ from scipy.sparse import csr_array
 from capture4d.body.skinning import PosedBody, with_shape
 from capture4d.errors import InputError
 from capture4d.geometry.mesh import vertex_adjacency
-from capture4d.heavy_imports import import_open3d
+from capture4d.geometry.ray_casting import TriangleScene, barycentric
 from capture4d.types import Body, Garment
 
 __all__ = ["WEIGHT_SMOOTHING", "bind", "diffuse", "embedded_offset", "with_body_shape"]
@@ -34,15 +34,12 @@ def bind(
     Args:
         vertices: on the body, best in a pose where the limbs are well apart.
     """
-    scene = import_open3d().t.geometry.RaycastingScene(nthreads=1)
     body_faces = body.shaped.body.template.faces
-    scene.add_triangles(body.vertices().astype(np.float32), body_faces.astype(np.uint32))
-    closest = scene.compute_closest_points(vertices.astype(np.float32))
-    at, uv = closest["primitive_ids"].numpy().astype(np.int32), closest["primitive_uvs"].numpy()
-    barycentric = np.column_stack([1 - uv.sum(axis=1), uv]).astype(np.float32)
-    weights = np.einsum("vk,vkj->vj", barycentric, body.shaped.body.skin_weights[body_faces[at]])
+    nearest = TriangleScene((body.vertices(), body_faces)).nearest(vertices)
+    within = barycentric(nearest.uv)
+    weights = np.einsum("vk,vkj->vj", within, body.shaped.body.skin_weights[body_faces[nearest.faces]])
     weights = diffuse(weights, faces, WEIGHT_SMOOTHING)
-    return at, barycentric, weights / weights.sum(axis=1, keepdims=True)
+    return nearest.faces, within, weights / weights.sum(axis=1, keepdims=True)
 
 
 def diffuse(

@@ -26,6 +26,7 @@ from scipy.spatial.transform import Rotation
 from capture4d.body.skinning import PosedBody, with_pose, with_shape
 from capture4d.geometry.mesh import face_areas
 from capture4d.geometry.mesh_kernels import vertex_normals_kernel
+from capture4d.geometry.triangles import closest_on_faces
 from capture4d.types import Body
 
 __all__ = ["BodyState", "Matches", "PosedSurface", "TrackedBody", "linearise", "match", "pose_surface", "tracked_body"]
@@ -144,7 +145,7 @@ def match(
     tree = KDTree(np.hstack([places, NORMAL_REACH_M * directions]), balanced_tree=False, compact_nodes=False)
     _, nearest = tree.query(np.hstack([points, NORMAL_REACH_M * normals]), k=faces)
     candidates = model.sample_faces[nearest.reshape(len(points), faces)]
-    face, barycentric = _closest_on_faces(points, candidates, surface.vertices, model.body.template.faces)
+    face, barycentric = closest_on_faces(points, candidates, surface.vertices, model.body.template.faces)
     on_body, outward = _interpolate(surface.vertices, surface.normals, model.body.template.faces, face, barycentric)
     return Matches(on_body, outward, face, barycentric)
 
@@ -269,71 +270,3 @@ def _interpolate(vertices, normals, faces, face_of, barycentric):
             for a in range(3):
                 outward[i, a] /= length
     return points, outward
-
-
-@njit(cache=True)
-def _closest_on_faces(points, candidates, vertices, faces):
-    """The nearest of the candidate faces of each point, and where in it."""
-    face = np.empty(len(points), np.int32)
-    barycentric = np.zeros((len(points), 3))
-    here = np.zeros(3)
-    for i in range(len(points)):
-        best = np.inf
-        for c in range(candidates.shape[1]):
-            f = candidates[i, c]
-            a, b, d = vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]
-            _closest_in_triangle(points[i], a, b, d, here)
-            distance = 0.0
-            for k in range(3):
-                distance += (points[i, k] - here[0] * a[k] - here[1] * b[k] - here[2] * d[k]) ** 2
-            if distance < best:
-                best = distance
-                face[i] = f
-                barycentric[i] = here
-    return face, barycentric
-
-
-@njit(cache=True)
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@njit(cache=True)
-def _closest_in_triangle(p, a, b, c, out):
-    """Barycentric coordinates of the nearest point (Ericson, Real-Time Collision Detection, 5.1.5)."""
-    ab, ac, ap = b - a, c - a, p - a
-    d1, d2 = _dot(ab, ap), _dot(ac, ap)
-    if d1 <= 0.0 and d2 <= 0.0:
-        out[0], out[1], out[2] = 1.0, 0.0, 0.0
-        return
-    bp = p - b
-    d3, d4 = _dot(ab, bp), _dot(ac, bp)
-    if d3 >= 0.0 and d4 <= d3:
-        out[0], out[1], out[2] = 0.0, 1.0, 0.0
-        return
-    vc = d1 * d4 - d3 * d2
-    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
-        t = d1 / (d1 - d3) if d1 != d3 else 0.0
-        out[0], out[1], out[2] = 1.0 - t, t, 0.0
-        return
-    cp = p - c
-    d5, d6 = _dot(ab, cp), _dot(ac, cp)
-    if d6 >= 0.0 and d5 <= d6:
-        out[0], out[1], out[2] = 0.0, 0.0, 1.0
-        return
-    vb = d5 * d2 - d1 * d6
-    if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
-        t = d2 / (d2 - d6) if d2 != d6 else 0.0
-        out[0], out[1], out[2] = 1.0 - t, 0.0, t
-        return
-    va = d3 * d6 - d5 * d4
-    if va <= 0.0 and (d4 - d3) >= 0.0 and (d5 - d6) >= 0.0:
-        total = (d4 - d3) + (d5 - d6)
-        t = (d4 - d3) / total if total > 0.0 else 0.0
-        out[0], out[1], out[2] = 0.0, 1.0 - t, t
-        return
-    total = va + vb + vc
-    if total <= 0.0:
-        out[0], out[1], out[2] = 1.0, 0.0, 0.0
-        return
-    out[0], out[1], out[2] = va / total, vb / total, vc / total

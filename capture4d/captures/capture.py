@@ -18,7 +18,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 
@@ -35,12 +35,11 @@ from capture4d.files.records import (
 )
 from capture4d.geometry.mesh import boundary_loops
 from capture4d.types import Body, Garment, PoseSequence, Rig, Scan
+from capture4d.units import METRES, Units
 
 __all__ = [
-    "METRES",
     "Capture",
     "CaptureFiles",
-    "Units",
     "capture_digest",
     "read_capture",
     "read_scan",
@@ -52,12 +51,6 @@ __all__ = [
 ]
 
 _FORMAT = 1
-
-Units = Literal["m", "cm", "mm", "in"]
-
-
-METRES: dict[Units, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
-"""Metres in a unit."""
 
 
 TEXTURE_SUFFIXES = (".mtl", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")

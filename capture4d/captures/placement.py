@@ -52,8 +52,7 @@ def place_rig(rig: Rig, placement: Placement, *, scale: float = 1.0) -> Rig:
         return rig
     T = rig.T_camera_world.copy()
     rotation = T[:, :3, :3] @ placement.axes.T
-    centres = -np.einsum("cba,cb->ca", T[:, :3, :3], T[:, :3, 3])
-    moved = scale * centres @ placement.axes.T + (0, placement.lift_m, 0)
+    moved = scale * rig.centres @ placement.axes.T + (0, placement.lift_m, 0)
     T[:, :3, :3] = rotation
     T[:, :3, 3] = -np.einsum("cab,cb->ca", rotation, moved)
     return replace(rig, T_camera_world=T)

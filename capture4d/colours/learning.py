@@ -29,6 +29,7 @@ from scipy.spatial import KDTree
 from capture4d.colours.labels import settle_labels
 from capture4d.colours.spaces import Colour, encode_colours, format_colour, linear_colours
 from capture4d.errors import InputError
+from capture4d.geometry.mesh import face_areas
 from capture4d.geometry.mesh_kernels import face_components, open_vertices, vertex_normals_kernel
 from capture4d.types import Mesh, Scan
 
@@ -313,8 +314,7 @@ def _bands(scans: Sequence[Scan], labels: Sequence[np.ndarray], colours: Sequenc
 
 def _vertex_area(mesh: Mesh) -> float:
     """Mean area that belongs to a vertex, square metres."""
-    a, b, c = (mesh.vertices[mesh.faces[:, corner]].astype(np.float64) for corner in range(3))
-    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2 / max(len(mesh.vertices), 1))
+    return float(face_areas(mesh.vertices.astype(np.float64), mesh.faces).sum() / max(len(mesh.vertices), 1))
 
 
 def _is_blend(index: int, colours: Sequence[Colour]) -> bool:

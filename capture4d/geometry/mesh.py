@@ -7,7 +7,7 @@ integer vertex indices, counter-clockwise seen from outside.
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float, Int32, Integer
+from jaxtyping import Bool, Float, Int32, Int64, Integer
 from scipy import sparse
 from scipy.sparse import csgraph
 
@@ -17,8 +17,11 @@ __all__ = [
     "boundary_edges",
     "boundary_loops",
     "connected_components",
+    "doubled_area_vectors",
+    "edge_uses",
+    "edges_of_faces",
     "face_areas",
-    "face_normals",
+    "half_edges",
     "normalised",
     "submesh",
     "unique_edges",
@@ -27,7 +30,10 @@ __all__ = [
 ]
 
 
-def _doubled_area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def doubled_area_vectors(
+    vertices: Float[np.ndarray, "V 3"], faces: Integer[np.ndarray, "F 3"]
+) -> Float[np.ndarray, "F 3"]:
+    """Normals of the faces, each as long as twice its area."""
     corner, along, across = (vertices[faces[:, k]] for k in range(3))
     return np.cross(along - corner, across - corner)
 
@@ -38,19 +44,14 @@ def normalised(vectors: np.ndarray) -> np.ndarray:
     return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
 
 
-def face_normals(vertices: Float[np.ndarray, "V 3"], faces: Integer[np.ndarray, "F 3"]) -> Float[np.ndarray, "F 3"]:
-    """Unit normals; zero for a face without area."""
-    return normalised(_doubled_area_vectors(vertices, faces))
-
-
 def face_areas(vertices: Float[np.ndarray, "V 3"], faces: Integer[np.ndarray, "F 3"]) -> Float[np.ndarray, " F"]:
     """Areas in the square of the vertices' unit."""
-    return np.linalg.norm(_doubled_area_vectors(vertices, faces), axis=1) / 2
+    return np.linalg.norm(doubled_area_vectors(vertices, faces), axis=1) / 2
 
 
 def vertex_normals(vertices: Float[np.ndarray, "V 3"], faces: Integer[np.ndarray, "F 3"]) -> Float[np.ndarray, "V 3"]:
     """Unit normals, averaged over the faces around a vertex by area; zero where there is no face with area."""
-    weighted = _doubled_area_vectors(vertices, faces)
+    weighted = doubled_area_vectors(vertices, faces)
     corners = faces.reshape(-1)
     total = np.empty_like(vertices)
     for axis in range(3):
@@ -58,8 +59,8 @@ def vertex_normals(vertices: Float[np.ndarray, "V 3"], faces: Integer[np.ndarray
     return normalised(total)
 
 
-def _half_edges(faces: np.ndarray) -> np.ndarray:
-    """All directed edges (3F, 2), in the winding of their faces."""
+def half_edges(faces: Integer[np.ndarray, "F 3"]) -> Integer[np.ndarray, "sides 2"]:
+    """All directed edges (3F, 2), in the winding of their faces: face 0's three, then face 1's."""
     return faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
 
 
@@ -70,13 +71,32 @@ def _edge_keys(edges: np.ndarray) -> np.ndarray:
 
 def unique_edges(faces: Integer[np.ndarray, "F 3"]) -> Int32[np.ndarray, "E 2"]:
     """Undirected edges, each once, the smaller index first, in ascending order."""
-    keys = np.unique(_edge_keys(_half_edges(faces)))
+    keys = np.unique(_edge_keys(half_edges(faces)))
+    return _edges_of_keys(keys)
+
+
+def _edges_of_keys(keys: np.ndarray) -> np.ndarray:
     return np.column_stack([keys >> 32, keys & 0xFFFFFFFF]).astype(np.int32)
+
+
+def edge_uses(faces: Integer[np.ndarray, "F 3"]) -> tuple[Int32[np.ndarray, "E 2"], Int64[np.ndarray, " E"]]:
+    """Undirected edges, as `unique_edges` has them, and how many faces each belongs to."""
+    keys, uses = np.unique(_edge_keys(half_edges(faces)), return_counts=True)
+    return _edges_of_keys(keys), uses
+
+
+def edges_of_faces(faces: Integer[np.ndarray, "F 3"], edges: Integer[np.ndarray, "E 2"]) -> Int64[np.ndarray, "F 3"]:
+    """Which of the edges the side behind each corner is.
+
+    Args:
+        edges: of these faces, as `unique_edges` returns them.
+    """
+    return np.searchsorted(_edge_keys(edges), _edge_keys(half_edges(faces))).reshape(-1, 3)
 
 
 def boundary_edges(faces: Integer[np.ndarray, "F 3"]) -> Int32[np.ndarray, "B 2"]:
     """Edges that belong to one face only, directed as that face winds."""
-    edges = _half_edges(faces)
+    edges = half_edges(faces)
     _, first, uses = np.unique(_edge_keys(edges), return_index=True, return_counts=True)
     return edges[first[uses == 1]].astype(np.int32)
 

@@ -13,6 +13,7 @@ from jaxtyping import Float, Float32, Int32
 from numba import njit
 
 from capture4d.geometry.mesh import connected_components, face_areas
+from capture4d.geometry.uv_layout import island_boxes, shelve
 from capture4d.types import Mesh
 
 __all__ = ["UvReport", "check_uv", "fresh_uv"]
@@ -90,21 +91,11 @@ def fresh_uv(mesh: Mesh) -> Float32[np.ndarray, "faces 3 2"]:
 
 
 def _shelves(places: Float[np.ndarray, "places 2"], chart: Int32[np.ndarray, " places"]) -> np.ndarray:
-    """Where to move each chart, (C, 2): the tall ones first, from left to right, row upon row."""
-    count = int(chart.max()) + 1
-    low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
-    np.minimum.at(low, chart, places)
-    np.maximum.at(high, chart, places)
+    """Where to move each chart, (C, 2), so that together they are about square."""
+    low, high = island_boxes(places, chart)
     sizes = high - low + MARGIN_M
     width = max(float(np.sqrt(sizes.prod(axis=1).sum())), float(sizes[:, 0].max()))
-    shifts, cursor, row = np.zeros((count, 2)), np.zeros(2), 0.0
-    for index in np.argsort(-sizes[:, 1], kind="stable"):
-        if cursor[0] + sizes[index, 0] > width and cursor[0] > 0:
-            cursor, row = np.array([0.0, cursor[1] + row]), 0.0
-        shifts[index] = cursor - low[index]
-        cursor[0] += sizes[index, 0]
-        row = max(row, float(sizes[index, 1]))
-    return shifts
+    return shelve(sizes, width) - low
 
 
 def _signed_areas(uv: Float[np.ndarray, "faces 3 2"]) -> Float[np.ndarray, " faces"]:

@@ -9,14 +9,22 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Float32, Int32
+from jaxtyping import Float, Float32, Float64, Int32, Integer
 
 from capture4d.errors import InputError
 from capture4d.geometry.mesh import face_areas
 from capture4d.geometry.tangents import TangentLayout
 from capture4d.types import Mesh
 
-__all__ = ["Layout", "millimetres_per_texel", "pack_islands", "require_uvs", "unit_square"]
+__all__ = [
+    "Layout",
+    "island_boxes",
+    "millimetres_per_texel",
+    "pack_islands",
+    "require_uvs",
+    "shelve",
+    "unit_square",
+]
 
 Layout = Literal["auto", "keep", "pack"]
 METRIC_TOLERANCE = 0.35
@@ -100,25 +108,41 @@ def _is_metric(mesh: Mesh) -> bool:
     return bool(abs(np.sqrt(_uv_area(mesh) / max(on_mesh, 1e-12)) - 1) < METRIC_TOLERANCE)
 
 
-def _boxes(uv: np.ndarray, island: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    count = int(island.max()) + 1
+def island_boxes(
+    points: Float[np.ndarray, "points 2"], islands: Integer[np.ndarray, " points"]
+) -> tuple[Float64[np.ndarray, "islands 2"], Float64[np.ndarray, "islands 2"]]:
+    """Lower and upper corner of the box around each island; which one a point belongs to is counted from 0."""
+    count = int(islands.max()) + 1
     low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
-    np.minimum.at(low, np.repeat(island, 3), uv.reshape(-1, 2).astype(float))
-    np.maximum.at(high, np.repeat(island, 3), uv.reshape(-1, 2).astype(float))
+    np.minimum.at(low, islands, points.astype(float))
+    np.maximum.at(high, islands, points.astype(float))
     return low, high
+
+
+def shelve(sizes: Float64[np.ndarray, "boxes 2"], width: float) -> Float64[np.ndarray, "boxes 2"]:
+    """Lower left corners of boxes on shelves: the tall ones first, from left to right, row upon row.
+
+    Args:
+        width: of the shelves; a box that is wider has one of its own and juts out.
+    """
+    corners = np.empty_like(sizes)
+    x = y = height = 0.0
+    for index in np.argsort(-sizes[:, 1], kind="stable"):
+        wide, tall = sizes[index]
+        if x + wide > width and x > 0:
+            x, y, height = 0.0, y + height, 0.0
+        corners[index] = x, y
+        x += wide
+        height = max(height, tall)
+    return corners
+
+
+def _boxes(uv: np.ndarray, island: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return island_boxes(uv.reshape(-1, 2), np.repeat(island, 3))
 
 
 def _rows(sizes: np.ndarray, side: float, gap: float) -> np.ndarray | None:
     """Lower left corners of boxes in a square of this side, half a gap around each; None if they do not fit."""
-    corners = np.empty_like(sizes)
-    x = y = height = 0.0
-    for index in np.argsort(-sizes[:, 1], kind="stable"):
-        width, tall = sizes[index] + gap
-        if x + width > side + 1e-12 and x > 0:
-            x, y, height = 0.0, y + height, 0.0
-        if x + width > side + 1e-12 or y + tall > side + 1e-12:
-            return None
-        corners[index] = x + gap / 2, y + gap / 2
-        x += width
-        height = max(height, tall)
-    return corners
+    boxes, room = sizes + gap, side + 1e-12
+    corners = shelve(boxes, room)
+    return corners + gap / 2 if (corners + boxes <= room).all() else None

@@ -17,7 +17,7 @@ from scipy.spatial import KDTree
 
 from capture4d.colours.labels import FIRST_PAINT, GARMENT, OTHER, classify_colours
 from capture4d.colours.spaces import Colour, colour_angles, to_lab
-from capture4d.geometry.mesh import boundary_edges, vertex_normals
+from capture4d.geometry.mesh import boundary_edges, doubled_area_vectors, face_areas, vertex_normals
 from capture4d.geometry.mesh_kernels import open_vertices
 from capture4d.types import Mesh, Rig, Scan
 
@@ -142,7 +142,7 @@ def measure_frame(
     mesh = scan.mesh
     vertices = mesh.vertices.astype(np.float64)
     corners = vertices[mesh.faces]
-    doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    doubled = np.linalg.norm(doubled_area_vectors(vertices, mesh.faces), axis=1)
     area = float(doubled.sum() / 2)
     lower, upper = np.percentile(vertices[mesh.faces[:, 0]], (0.5, 99.5), axis=0)
     dressed = np.zeros(len(vertices), bool)
@@ -177,10 +177,10 @@ def outwardness(mesh: Mesh) -> float:
 
     It is the enclosed volume over that of a ball as far away, and bears holes well: a clothed person has 0.2 to 0.5.
     """
-    corners = mesh.vertices.astype(np.float64)[mesh.faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    vertices = mesh.vertices.astype(np.float64)
+    normals = doubled_area_vectors(vertices, mesh.faces)
     size = np.linalg.norm(normals, axis=1)
-    arms = corners.mean(axis=1)
+    arms = vertices[mesh.faces].mean(axis=1)
     arms = arms - arms.T @ size / max(size.sum(), 1e-12)
     reach = float(np.linalg.norm(arms, axis=1) @ size)
     return float(np.einsum("fa,fa->", arms, normals) / max(reach, 1e-12))
@@ -215,8 +215,7 @@ def hole_share(mesh: Mesh) -> float:
     rim = rim[is_open[rim].all(axis=1)]
     if not len(rim):
         return 0.0
-    corners = mesh.vertices.astype(np.float64)[mesh.faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
+    area = face_areas(mesh.vertices.astype(np.float64), mesh.faces).sum()
     graph = sparse.coo_array((np.ones(len(rim), bool), (rim[:, 0], rim[:, 1])), shape=(len(mesh.vertices),) * 2)
     _, part = csgraph.connected_components(graph, directed=False)
     ends = mesh.vertices.astype(np.float64)[rim]

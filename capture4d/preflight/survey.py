@@ -19,12 +19,12 @@ import numpy as np
 from jaxtyping import Float, Float64
 from scipy.spatial import KDTree
 
-from capture4d.captures.capture import METRES, Units
 from capture4d.captures.placement import Placement
-from capture4d.geometry.mesh import face_areas
+from capture4d.geometry.mesh import doubled_area_vectors, face_areas
 from capture4d.preflight.motion import CLIP_M, Motion, fit_person, fit_posed_bodies, floor_by_poses
 from capture4d.preflight.statistics import outwardness
 from capture4d.types import Mesh
+from capture4d.units import METRES, Units
 
 __all__ = [
     "MannequinFit",
@@ -227,13 +227,13 @@ def sample_surface(mesh: Mesh, *, outward: bool = True, count: int = PROBE_POINT
     Args:
         outward: the faces wind counter-clockwise seen from outside.
     """
-    corners = mesh.vertices.astype(np.float64)[mesh.faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    vertices = mesh.vertices.astype(np.float64)
+    normals = doubled_area_vectors(vertices, mesh.faces)
     size = np.linalg.norm(normals, axis=1)
     area = size.cumsum()
     chosen = np.searchsorted(area, (np.arange(count) + 0.5) / count * area[-1])
     unit = normals[chosen] / np.maximum(size[chosen, None], 1e-12) * (NORMAL_M if outward else -NORMAL_M)
-    return np.hstack([corners[chosen].mean(axis=1), unit])
+    return np.hstack([vertices[mesh.faces[chosen]].mean(axis=1), unit])
 
 
 def find_units(size: float) -> tuple[Units, float]:

@@ -17,16 +17,17 @@ import numpy as np
 from capture4d.body.anny import load_anny
 from capture4d.body.posed_surface import BodyState, TrackedBody, tracked_body
 from capture4d.body.skinning import ShapedBody, pose_frame, with_shape
-from capture4d.captures.capture import METRES
 from capture4d.colours.spaces import parse_colour
 from capture4d.errors import EmptyMeshError, InputError, NotFiniteError
 from capture4d.files.atomic import read_json
 from capture4d.files.meshes import MESH_SUFFIXES, read_coloured_mesh
 from capture4d.files.polygons import MeshFile
 from capture4d.files.records import load_body, load_poses, load_rig
+from capture4d.geometry.mesh import doubled_area_vectors
 from capture4d.preflight.statistics import Paints
 from capture4d.preflight.verdict import BadFrame, TakeFacts
 from capture4d.types import PoseSequence, Rig
+from capture4d.units import METRES
 
 __all__ = ["Claims", "TakeFolder", "body_state", "open_take", "posed_body", "read_frame", "time_stamp", "tracked_model"]
 
@@ -175,8 +176,7 @@ def read_frame(path: Path, frame_id: int) -> MeshFile | BadFrame:
         return BadFrame(frame_id, "frame-nan", str(error))
     except InputError as error:
         return BadFrame(frame_id, "frame-unreadable", str(error))
-    corners = found.mesh.vertices[found.mesh.faces]
-    if not np.any(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])):
+    if not np.any(doubled_area_vectors(found.mesh.vertices, found.mesh.faces)):
         return BadFrame(frame_id, "frame-empty", f"{path}: all faces are without area")
     return found
 

@@ -13,10 +13,10 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from capture4d.captures.capture import METRES
 from capture4d.colours.spaces import colour_angles, to_lab
 from capture4d.preflight.statistics import FrameStatistics, Paints
 from capture4d.preflight.survey import MAX_FLOOR_M, MAX_SIZE_RATIO, Survey
+from capture4d.units import METRES
 
 __all__ = ["CODES", "BadFrame", "Code", "Finding", "Limits", "Severity", "TakeFacts", "Verdict", "judge", "true_rate"]
 

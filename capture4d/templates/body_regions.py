@@ -18,10 +18,9 @@ from capture4d.errors import InputError
 from capture4d.geometry.mesh import connected_components, submesh
 from capture4d.types import Mesh
 
-__all__ = ["REGIONS", "Region", "body_region"]
+__all__ = ["Region", "body_region"]
 
 Region = Literal["tshirt", "longsleeve", "trousers", "shorts"]
-REGIONS: tuple[Region, ...] = ("tshirt", "longsleeve", "trousers", "shorts")
 
 JOINTS: dict[str, tuple[str, ...]] = {
     "neck": (r"^neck01$", r"^neck$"),

@@ -19,7 +19,7 @@ from capture4d.body.binding import WEIGHT_SMOOTHING, diffuse
 from capture4d.body.posed_surface import PosedSurface, match, tracked_body
 from capture4d.body.skinning import PosedBody, unskin
 from capture4d.errors import InputError
-from capture4d.geometry.mesh import boundary_loops, vertex_normals
+from capture4d.geometry.mesh import boundary_loops, edge_uses, half_edges, vertex_normals
 from capture4d.geometry.uv_atlas import UvReport, check_uv, fresh_uv
 from capture4d.types import Body, Garment, Mesh
 
@@ -122,11 +122,10 @@ def weld(mesh: Mesh) -> Mesh:
 
 
 def _require_surface(mesh: Mesh, source: str) -> None:
-    edges = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    edges, uses = edge_uses(mesh.faces)
     if (edges[:, 0] == edges[:, 1]).any():
         bad = int(np.flatnonzero((np.diff(np.sort(mesh.faces, axis=1), axis=1) == 0).any(axis=1))[0])
         raise InputError(f"{source}: expected three different corners in every face, face {bad} uses one twice")
-    _, uses = np.unique(edges, axis=0, return_counts=True)
     if (uses > 2).any():
         count = int((uses > 2).sum())
         raise InputError(f"{source}: expected at most two faces at an edge, found more at {count} of {len(uses)} edges")
@@ -140,7 +139,7 @@ def _require_surface(mesh: Mesh, source: str) -> None:
 
 
 def _has_mixed_winding(mesh: Mesh) -> bool:
-    directed = mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    directed = half_edges(mesh.faces)
     return len(np.unique(directed, axis=0)) < len(directed)
 
 

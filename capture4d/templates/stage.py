@@ -10,13 +10,13 @@ import numpy as np
 from capture4d.body.anny import load_anny
 from capture4d.body.motion_files import read_motion
 from capture4d.body.skinning import PosedBody, pose_frame, with_pose, with_shape
-from capture4d.captures.capture import METRES, Units
 from capture4d.errors import InputError
 from capture4d.files.meshes import read_mesh
 from capture4d.files.records import load_body, save_garment
 from capture4d.templates.body_regions import Region, body_region
 from capture4d.templates.garment import TemplateReport, UvChoice, make_template, weld
 from capture4d.types import Body, Garment
+from capture4d.units import METRES, Units
 
 __all__ = ["run"]
 
@@ -69,13 +69,10 @@ def _posed(body: Body, poses: Path | None, frame: int | None) -> PosedBody:
     if poses is None:
         return _at_rest(body, np.zeros(0, np.float32))
     motion = read_motion(poses, body)
-    row = 0
-    if frame is not None:
-        rows = np.flatnonzero(motion.frame_ids == frame)
-        if not len(rows):
-            first, last = motion.frame_ids[0], motion.frame_ids[-1]
-            raise InputError(f"{poses}: expected a pose for frame {frame}, found frames {first} to {last}")
-        row = int(rows[0])
+    try:
+        row = 0 if frame is None else motion.row(frame)
+    except InputError as error:
+        raise error.at(poses) from error
     return pose_frame(with_shape(body, motion.shape), motion, row)
 
 

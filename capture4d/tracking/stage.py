@@ -174,8 +174,7 @@ def _start(tracker: Tracker, config: TrackingConfig, frame_id: int) -> BodyState
     if config.start == "rest":
         return rest
     poses = read_motion(Path(config.start), tracker.model.body)
-    rows = np.flatnonzero(poses.frame_ids == frame_id)
-    row = int(rows[0]) if len(rows) else 0
+    row = poses.row(frame_id) if frame_id in poses.frame_ids else 0
     shape = np.zeros_like(rest.shape)
     shape[: len(poses.shape)] = poses.shape[: len(shape)]
     return BodyState(poses.rotations[row].astype(np.float64), poses.translations[row].astype(np.float64), shape)

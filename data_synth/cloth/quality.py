@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from capture4d.geometry.mesh import face_areas
-from capture4d.heavy_imports import import_open3d
+from capture4d.geometry.ray_casting import TriangleScene
 from data_synth.cloth.patterns import PanelMesh
 from data_synth.cloth.wrinkle_relaxation import WrinkleMesh
 
@@ -25,16 +25,13 @@ INSIDE_LIMIT_PERCENT = 0.1
 class ClothQuality:
     """One frame of simulated cloth."""
 
-    stretch_p1: float
     stretch_p99: float
-    """Edge length over rest length, percentiles."""
+    """Edge length over rest length, 99th percentile."""
     crushed_faces: int
     overstretched_faces: int
     """Faces outside `AREA_LIMITS`."""
     inside_body_percent: float
     """Vertices inside the body."""
-    deepest_mm: float
-    """The deepest of them."""
     reasons: tuple[str, ...]
     """Why the frame should not be trusted; empty for a good one."""
 
@@ -48,10 +45,8 @@ def measure_cloth(
     first, second = mesh.uv[:, 1] - mesh.uv[:, 0], mesh.uv[:, 2] - mesh.uv[:, 0]
     rest_area = 0.5 * np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
     area = face_areas(vertices.astype(np.float64), mesh.faces) / rest_area
-    scene = import_open3d().t.geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(surface.astype(np.float32), body_faces.astype(np.uint32))
-    depth = -scene.compute_signed_distance(vertices.astype(np.float32)).numpy()
-    p1, p99 = np.percentile(stretch, [1, 99])
+    depth = -TriangleScene((surface, body_faces)).signed_distances(vertices)
+    p99 = float(np.percentile(stretch, 99))
     crushed, over = int((area < AREA_LIMITS[0]).sum()), int((area > AREA_LIMITS[1]).sum())
     inside = 100 * float((depth > 0).mean())
     reasons = []
@@ -61,4 +56,4 @@ def measure_cloth(
         reasons.append(f"{inside:.2f} % of the vertices inside the body")
     if crushed + over > 0.001 * len(area):
         reasons.append(f"{crushed} faces crushed and {over} overstretched")
-    return ClothQuality(float(p1), float(p99), crushed, over, inside, 1e3 * float(max(depth.max(), 0)), tuple(reasons))
+    return ClothQuality(p99, crushed, over, inside, tuple(reasons))

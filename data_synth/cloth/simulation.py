@@ -21,7 +21,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from capture4d.body.binding import bind
 from capture4d.body.skinning import PosedBody, ShapedBody, skin, unskin, with_pose
 from capture4d.geometry.mesh import unique_edges, vertex_normals
-from capture4d.heavy_imports import import_open3d, import_warp
+from capture4d.geometry.ray_casting import TriangleScene
+from capture4d.heavy_imports import import_warp
 from capture4d.types import PoseSequence
 from data_synth.cloth.patterns import PanelMesh, Pattern, smooth_noise
 from data_synth.config import Fabric, SimulationConfig
@@ -73,7 +74,7 @@ def dress(shaped: ShapedBody, mesh: PanelMesh, pattern: Pattern, first: PosedBod
         Vertex positions (V, 3), metres.
     """
     surface = with_pose(shaped, dressing_rotations(shaped), np.zeros(3)).vertices()
-    body = _Surface.create(surface, shaped.body.template.faces)
+    body = _Surface(TriangleScene((surface, shaped.body.template.faces)))
     names = shaped.body.joint_names
     shoulder = shaped.joints[names.index("upperarm01.L")]
     trunk = surface[(np.abs(surface[:, 0]) < 0.12) & (np.abs(surface[:, 1] - shoulder[1] + 0.15) < 0.25)]
@@ -124,19 +125,13 @@ def _tube(draft: np.ndarray, arm: np.ndarray, sign: float, start_x: float) -> np
 class _Surface:
     """A body that is looked up many times."""
 
-    scene: Any
-
-    @staticmethod
-    def create(vertices: np.ndarray, faces: np.ndarray) -> _Surface:
-        scene = import_open3d().t.geometry.RaycastingScene(nthreads=1)
-        scene.add_triangles(vertices.astype(np.float32), faces.astype(np.uint32))
-        return _Surface(scene)
+    scene: TriangleScene
 
     def heights(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Height over the nearest face, (V,) metres, negative inside; that face's nearest point and normal, (V, 3)."""
-        closest = self.scene.compute_closest_points(points.astype(np.float32))
-        foot, normals = closest["points"].numpy(), closest["primitive_normals"].numpy()
-        return np.einsum("vc,vc->v", points.astype(np.float32) - foot, normals), foot, normals
+        found = self.scene.nearest(points)
+        heights = np.einsum("vc,vc->v", points.astype(np.float32) - found.points, found.normals)
+        return heights, found.points, found.normals
 
 
 def _push_outside(points: np.ndarray, surface: _Surface, clearance: float) -> np.ndarray:

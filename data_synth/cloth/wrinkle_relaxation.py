@@ -15,17 +15,16 @@ Boubekeur and Alexa (2008).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numba import njit
 
-from capture4d.geometry.mesh import unique_edges, vertex_adjacency, vertex_normals
-from capture4d.heavy_imports import import_open3d
+from capture4d.geometry.mesh import edges_of_faces, unique_edges, vertex_adjacency, vertex_normals
+from capture4d.geometry.ray_casting import TriangleScene, barycentric
 from data_synth.cloth.patterns import PanelMesh, locate, smooth_noise
 from data_synth.config import Fabric, RelaxationConfig
 
-__all__ = ["BodyPlanes", "WrinkleMesh", "body_planes", "relax_frame", "wrinkle_mesh"]
+__all__ = ["BodyPlanes", "BodySurface", "WrinkleMesh", "relax_frame", "wrinkle_mesh"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,9 +97,7 @@ def _corner_lengths(mesh: PanelMesh) -> np.ndarray:
 def _rest_lengths(mesh: PanelMesh) -> tuple[np.ndarray, np.ndarray]:
     """Unique edges, and their length on the pattern; an edge on a seam takes the mean of its two sides."""
     edges = unique_edges(mesh.faces)
-    sides = np.sort(mesh.faces[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2).astype(np.int64), axis=1)
-    keys = edges[:, 0].astype(np.int64) * mesh.vertex_count + edges[:, 1]
-    slot = np.searchsorted(keys, sides[:, 0] * mesh.vertex_count + sides[:, 1])
+    slot = edges_of_faces(mesh.faces, edges)[:, [1, 2, 0]].ravel()  # the side opposite each corner
     lengths = _corner_lengths(mesh).ravel()
     return edges, np.bincount(slot, lengths, len(edges)) / np.bincount(slot, minlength=len(edges))
 
@@ -163,35 +160,25 @@ def lift(mesh: WrinkleMesh, coarse: np.ndarray, smoothing: float = 0.6) -> tuple
     return curved, normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
 
-def body_planes(points: np.ndarray, surface: np.ndarray, faces: np.ndarray) -> BodyPlanes:
-    """Nearest body point and smooth normal for each cloth point."""
-    return _BodySurface.create(surface, faces).planes(points)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
-class _BodySurface:
+class BodySurface:
     """A posed body that is looked up several times."""
 
-    scene: Any
+    scene: TriangleScene
     faces: np.ndarray
     normals: np.ndarray
 
     @staticmethod
-    def create(surface: np.ndarray, faces: np.ndarray) -> _BodySurface:
-        scene = import_open3d().t.geometry.RaycastingScene(nthreads=1)
-        scene.add_triangles(surface.astype(np.float32), faces.astype(np.uint32))
-        return _BodySurface(scene, faces, vertex_normals(surface, faces))
+    def create(surface: np.ndarray, faces: np.ndarray) -> BodySurface:
+        return BodySurface(TriangleScene((surface, faces)), faces, vertex_normals(surface, faces))
 
     def planes(self, points: np.ndarray) -> BodyPlanes:
-        closest = self.scene.compute_closest_points(points.astype(np.float32))
-        uv = closest["primitive_uvs"].numpy()
-        corners = self.faces[closest["primitive_ids"].numpy()]
-        weights = np.column_stack([1 - uv.sum(axis=1), uv])
-        normals = np.einsum("vk,vkc->vc", weights, self.normals[corners])
-        return BodyPlanes(closest["points"].numpy(), normals / np.linalg.norm(normals, axis=1, keepdims=True))
+        nearest = self.scene.nearest(points)
+        normals = np.einsum("vk,vkc->vc", barycentric(nearest.uv), self.normals[self.faces[nearest.faces]])
+        return BodyPlanes(nearest.points, normals / np.linalg.norm(normals, axis=1, keepdims=True))
 
 
-def _may_touch(mesh: WrinkleMesh, coarse: np.ndarray, base: np.ndarray, body: _BodySurface, reach: float) -> np.ndarray:
+def _may_touch(mesh: WrinkleMesh, coarse: np.ndarray, base: np.ndarray, body: BodySurface, reach: float) -> np.ndarray:
     """Which fine vertices may lie within `reach` of the body, (n,); four in ten do not, and are not looked up.
 
     A vertex is no nearer to the body than a coarse vertex beside it less the way between them.
@@ -232,7 +219,7 @@ def relax_frame(
     else:
         offsets = config.warm_start * previous_offsets + (1 - config.warm_start) * offsets
     points = (base + np.einsum("vji,vj->vi", frames, offsets)).astype(np.float32)
-    body = _BodySurface.create(surface, body_faces)
+    body = BodySurface.create(surface, body_faces)
     near = _may_touch(mesh, coarse, base, body, config.radius_m + 2 * config.body_margin_m)
     plane_points, plane_normals = (base - normals).astype(np.float32), normals.astype(np.float32)  # out of the way
     for planes_at in (base, points):  # the body is a half plane per vertex, so it is looked up again half-way

@@ -13,6 +13,7 @@ from typing import assert_never
 import numpy as np
 from jaxtyping import Float32
 
+from capture4d.colours.spaces import nearly_encoded, nearly_linear
 from capture4d.geometry.mesh import vertex_normals
 from capture4d.types import Rig
 from data_synth.scanner.config import Lighting, ShadingConfig
@@ -83,5 +84,5 @@ def _lamplit(surface: Surface, normals: np.ndarray, lights: _Lamps, rig: Rig) ->
         distance = np.linalg.norm(toward, axis=1)
         lambert = np.clip(np.einsum("ij,ij->i", toward, normals) / distance, 0, None)
         total += (lambert * (place @ place) / distance**2)[:, None] * np.array(lamp.colour)
-    linear = (surface.colours / 255.0) ** 2.2 * total
-    return (linear ** (1 / 2.2)).astype(np.float32)
+    linear = nearly_linear(surface.colours / 255.0) * total
+    return nearly_encoded(linear).astype(np.float32)

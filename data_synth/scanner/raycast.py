@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, no_type_check
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float32, Integer, UInt8
 from numba import njit
 
-from capture4d.heavy_imports import import_open3d
+from capture4d.geometry.ray_casting import TriangleScene
 from capture4d.types import Mesh, Rig
 
 __all__ = ["NOTHING", "CameraImages", "Surface", "SurfaceScene", "nearest_surface"]
@@ -76,12 +76,9 @@ class SurfaceScene:
             lit: vertex colours, 0 to 1, under the light; None shows the surfaces' own colours.
             thickness_m: how much nearer the back of a surface is than its front.
         """
-        geometry = import_open3d().t.geometry
-        self._scene = geometry.RaycastingScene(nthreads=1)
+        self._scene = TriangleScene(*((surface.mesh.vertices, surface.mesh.faces) for surface in surfaces))
         self._thickness = np.float32(thickness_m)
         self._first_face = np.cumsum([0, *(len(s.mesh.faces) for s in surfaces)])
-        for surface in surfaces:
-            self._scene.add_triangles(_tensor(surface.mesh.vertices), _tensor(surface.mesh.faces.astype(np.uint32)))
         corner_colours = [(lit or unlit)(s)[s.mesh.faces] for s in surfaces]
         self._corner_colours = np.concatenate(corner_colours)  # (F, 3 corners, 3)
 
@@ -101,7 +98,7 @@ class SurfaceScene:
         v, u = v[inside], u[inside]
         shape = min(shape[0], height - top), min(shape[1], width - left)
         rays = _rays(rig, camera, u.astype(np.float32), v.astype(np.float32))
-        answer = self._scene.cast_rays(_tensor(rays), nthreads=1)
+        hits = self._scene.cast(rays)
         depth, cosine = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
         surface, colours = np.full(shape, NOTHING, np.uint8), np.zeros((*shape, 3), np.float32)
         _fill_images(
@@ -111,11 +108,11 @@ class SurfaceScene:
             colours,
             (v - top, u - left),
             rays,
-            answer["t_hit"].numpy(),
-            answer["geometry_ids"].numpy(),
-            answer["primitive_ids"].numpy(),
-            answer["primitive_uvs"].numpy(),
-            answer["primitive_normals"].numpy(),
+            hits.distance,
+            hits.surfaces,
+            hits.faces,
+            hits.uv,
+            hits.normals,
             self._first_face,
             self._corner_colours,
             self._thickness,
@@ -128,16 +125,16 @@ class SurfaceScene:
         """Cosine of the angle at which light from a point reaches points of the surfaces, 0 in the shadow."""
         rays = np.empty((len(points), 6), np.float32)
         rays[:, :3], rays[:, 3:] = lamp, points - lamp
-        answer = self._scene.cast_rays(_tensor(rays), nthreads=1)
-        reached = answer["t_hit"].numpy() > 1 - SHADOW_BIAS
-        toward = np.einsum("ij,ij->i", rays[:, 3:], answer["primitive_normals"].numpy())
+        hits = self._scene.cast(rays)
+        reached = hits.distance > 1 - SHADOW_BIAS
+        toward = np.einsum("ij,ij->i", rays[:, 3:], hits.normals)
         return np.where(reached, np.abs(toward) / np.linalg.norm(rays[:, 3:], axis=1), np.float32(0))
 
     def _occupied_tiles(self, rig: Rig, camera: int, width: int, height: int) -> Bool[np.ndarray, "rows columns"]:
         """Tiles whose centre, or a neighbour's, hits something."""
         columns, rows = -(-width // TILE), -(-height // TILE)
         v, u = (index.ravel() * TILE + TILE // 2 for index in np.indices((rows, columns)))
-        probes = self._scene.test_occlusions(_tensor(_rays(rig, camera, u, v)), nthreads=1).numpy()
+        probes = self._scene.is_met(_rays(rig, camera, u, v))
         tiles = np.pad(probes.reshape(rows, columns), 1)
         tiles = tiles[:-2] | tiles[1:-1] | tiles[2:]
         return tiles[:, :-2] | tiles[:, 1:-1] | tiles[:, 2:]
@@ -145,10 +142,7 @@ class SurfaceScene:
 
 def nearest_surface(meshes: Sequence[Mesh], points: Float32[np.ndarray, "points 3"]) -> Integer[np.ndarray, " points"]:
     """Which of the meshes is nearest to each point."""
-    scene = import_open3d().t.geometry.RaycastingScene(nthreads=1)
-    for mesh in meshes:
-        scene.add_triangles(_tensor(mesh.vertices), _tensor(mesh.faces.astype(np.uint32)))
-    return scene.compute_closest_points(_tensor(points), nthreads=1)["geometry_ids"].numpy()
+    return TriangleScene(*((mesh.vertices, mesh.faces) for mesh in meshes)).nearest(points).surfaces
 
 
 def unlit(surface: Surface) -> Float32[np.ndarray, "verts 3"]:
@@ -202,7 +196,3 @@ def _fill_images(
             colours[row, column, channel] = (
                 (1 - second - third) * corners[0, channel] + second * corners[1, channel] + third * corners[2, channel]
             )
-
-
-def _tensor(array: np.ndarray) -> Any:
-    return import_open3d().core.Tensor.from_numpy(np.ascontiguousarray(array))

@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
+from capture4d.colours.spaces import nearly_linear
 from capture4d.types import Rig
 from data_synth.scanner.config import StereoConfig
 from data_synth.scanner.depth_noise import periodic_gaussian_field, silhouettes
@@ -124,7 +125,7 @@ def _magnified(rig: Rig, camera: int, factor: int) -> Rig:
 
 def _albedo(view: CameraImages) -> Float32[np.ndarray, "h w"]:
     """Grey of the colours in linear light."""
-    return (view.colours**2.2) @ np.array([0.3, 0.5, 0.2], np.float32)
+    return nearly_linear(view.colours) @ np.array([0.3, 0.5, 0.2], np.float32)
 
 
 @cache

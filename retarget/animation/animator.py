@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from capture4d.body.skinning import ShapedBody, pose_frame
+from capture4d.geometry.intersection_removal import ClosedSurface, IntersectionRemoval, Removed
 from capture4d.geometry.mesh import unique_edges
 from capture4d.types import BlendshapeModel, PoseSequence
-from retarget.animation.intersections import BodySurface, IntersectionRemoval, Removed
 from retarget.config import AnimateConfig
 from retarget.shapes.blendshapes import reconstruct, skin_frames
 
@@ -67,7 +67,7 @@ class Animator:
         faces = self._person.body.template.faces
         found = []
         for vertices, body in zip(placed, posed, strict=True):
-            removed = self._removal(vertices, BodySurface(body.vertices(), faces))
+            removed = self._removal(vertices, ClosedSurface(body.vertices(), faces))
             stretch = self._edge_lengths(removed.vertices) / np.maximum(self._lengths, 1e-9)
             found.append(AnimatedFrame(removed.vertices.astype(np.float32), removed, float(np.percentile(stretch, 99))))
         return found

@@ -23,12 +23,12 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int64
-from scipy.linalg import cho_factor, cho_solve
 
 from capture4d.errors import InputError
+from capture4d.learning.kernels import likeness, ridge_answers
 from retarget.config import KernelConfig
 from retarget.regression.controls import ControlLayout
-from retarget.regression.kernel_views import Views, control_groups, kernel_views, likeness
+from retarget.regression.kernel_views import Views, control_groups, kernel_views
 from retarget.regression.regressors import (
     Clip,
     FittingClips,
@@ -127,17 +127,12 @@ def _fit(
         known, wanted = known[kept], wanted[kept]
     seen = _seen(known, views)
     alike = likeness(seen, seen, shares, line)
-    found = []
-    for ridge in ridges:
-        factor = cho_factor(alike + ridge * np.eye(len(alike)), check_finite=False)
-        answers = cho_solve(factor, wanted - middle, check_finite=False)
-        found.append(
-            KernelRegressor(
-                layout, scales, views, shares, line, known,
-                answers.astype(np.float32), middle.astype(np.float32), ridge,
-            )
-        )  # fmt: skip
-    return found
+    return [
+        KernelRegressor(
+            layout, scales, views, shares, line, known, answers.astype(np.float32), middle.astype(np.float32), ridge
+        )
+        for ridge, answers in zip(ridges, ridge_answers(alike, wanted - middle, ridges), strict=True)
+    ]
 
 
 def _tuned(

@@ -19,8 +19,9 @@ import torch
 from jaxtyping import Float32, Float64, Int
 from scipy.optimize import minimize
 
+from capture4d.learning.principal_directions import main_directions
 from retarget.config import KernelTuningConfig
-from retarget.regression.kernel_views import KINDS, Views, main_directions
+from retarget.regression.kernel_views import KINDS, Views
 
 __all__ = ["Fold", "Tuning", "tune_kernels"]
 

@@ -5,19 +5,19 @@ Letters: D controls, K coefficients, V views.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64, Int64
+from jaxtyping import Float32, Float64, Int64
 
 from capture4d.errors import InputError
+from capture4d.learning.principal_directions import main_directions
 from retarget.config import KernelConfig
 from retarget.regression.controls import ControlLayout
 from retarget.regression.regressors import usual_response
 from retarget.shapes.mirroring import opposite_joints
 
-__all__ = ["KINDS", "Views", "control_groups", "kernel_views", "likeness", "main_directions"]
+__all__ = ["KINDS", "Views", "control_groups", "kernel_views"]
 
 STILL = 1e-6
 """A side that moves the garment by less than this share of what everything does has no kernels of its own."""
@@ -81,14 +81,6 @@ def kernel_views(
     return Views(tuple(views), tuple(kinds), weights)
 
 
-def main_directions(rows: Float64[np.ndarray, "rows shapes"], kept: float) -> Float64[np.ndarray, "rows directions"]:
-    """Rows along as many of their principal directions as hold a share of their square: about the same lengths and
-    distances in fewer numbers."""
-    left, values, _ = np.linalg.svd(rows, full_matrices=False)
-    held = np.cumsum(values**2) / max(float((values**2).sum()), 1e-30)
-    return (left * values)[:, : int(np.searchsorted(held, kept)) + 1]
-
-
 def _usual_square(features: Float64[np.ndarray, "frames features"]) -> float:
     """Mean squared distance of two frames; positive."""
     return max(2 * float(features.var(axis=0).sum()), 1e-30)
@@ -128,24 +120,3 @@ def control_groups(layout: ControlLayout) -> Int64[np.ndarray, " controls"]:
     for count in (*others, *(6 * len(layout.joints) for _ in range(sets * lags))):
         parts.append(np.full(count, parts[-1].max(initial=0) + 1))
     return np.concatenate(parts)
-
-
-def likeness(
-    ours: Sequence[Float64[np.ndarray, "frames _"]],
-    theirs: Sequence[Float64[np.ndarray, "others _"]],
-    shares: Float[np.ndarray, " views"],
-    line: float,
-) -> Float64[np.ndarray, "frames others"]:
-    """How much alike frames are to others: the sum of all kernels.
-
-    Args:
-        ours: what each view sees of the frames.
-        theirs: and of the others.
-        shares: weights of the Gaussian kernels.
-        line: weight of the linear kernel, which compares what the first view sees.
-    """
-    total = line * ours[0] @ theirs[0].T
-    for one, other, share in zip(ours, theirs, shares, strict=True):
-        squares = (one**2).sum(axis=1)[:, None] + (other**2).sum(axis=1) - 2 * one @ other.T
-        total += float(share) * np.exp(-0.5 * np.maximum(squares, 0))
-    return total

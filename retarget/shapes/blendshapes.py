@@ -20,9 +20,9 @@ from jaxtyping import Float, Float32, Float64, Integer
 
 from capture4d.body.skinning import blend_transforms
 from capture4d.errors import InputError
+from capture4d.learning.principal_directions import blocks, exact_directions, randomised_directions
 from capture4d.types import BlendshapeModel
 from retarget.config import ShapeConfig
-from retarget.shapes.principal_directions import blocks, exact_directions, randomised_directions
 
 __all__ = [
     "ShapeSpace",

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from wrinkles.normal_maps.config import NetworkConfig
 
-__all__ = ["PatchDiscriminator", "UNet", "receptive_field", "set_test_statistics"]
+__all__ = ["PatchDiscriminator", "UNet", "set_test_statistics"]
 
 Image = Float[Tensor, "batch 3 size size"]
 
@@ -97,14 +97,6 @@ class PatchDiscriminator(nn.Module):
 
     def forward(self, low: Image, high: Image) -> Float[Tensor, "batch 1 rows columns"]:
         return self.layers(torch.cat([low, high], dim=1))
-
-
-def receptive_field(network: nn.Module) -> int:
-    """Side of the input patch that one output of a chain of convolutions sees."""
-    side = 1
-    for layer in reversed([each for each in network.modules() if isinstance(each, nn.Conv2d)]):
-        side = (side - 1) * layer.stride[0] + layer.kernel_size[0]
-    return side
 
 
 def set_test_statistics(network: nn.Module, statistics: Literal["instance", "running"]) -> None:

@@ -21,8 +21,8 @@ from jaxtyping import Bool, Float, Float32, Float64
 from capture4d.errors import InputError
 from capture4d.geometry.mesh import normalised
 from capture4d.geometry.mesh_kernels import laplacian_pass, open_vertices, vertex_normals_kernel
+from capture4d.geometry.ray_casting import TriangleScene, barycentric
 from capture4d.geometry.uv_raster import UvRaster
-from capture4d.heavy_imports import import_open3d
 from capture4d.types import Mesh
 from wrinkles.normal_maps.config import ProjectionConfig
 
@@ -56,9 +56,7 @@ def project_scan(
     if not len(scan.faces):
         raise InputError("scan: expected a garment with faces, found none")
     scan_normals, trusted = _scan_surface(scan, config)
-    geometry = import_open3d().t.geometry
-    scene = geometry.RaycastingScene(nthreads=1)
-    scene.add_triangles(scan.vertices, scan.faces.astype(np.uint32))
+    scene = TriangleScene((scan.vertices, scan.faces))
     points, normals = points.astype(np.float32), normals.astype(np.float32)
     gate = float(np.cos(np.radians(config.angle_deg)))
 
@@ -70,24 +68,21 @@ def project_scan(
         """Take answers that are near enough, face the same way, lie on trusted faces, and beat an earlier one."""
         near = (distance <= config.distance_m) & (distance < nearest[index])
         index, distance, face, uv = index[near], distance[near], face[near], uv[near]
-        weights = np.column_stack([1 - uv.sum(axis=1), uv])
-        normal = normalised(np.einsum("nk,nkc->nc", weights, scan_normals[scan.faces[face]]))
+        normal = normalised(np.einsum("nk,nkc->nc", barycentric(uv), scan_normals[scan.faces[face]]))
         good = (np.einsum("nc,nc->n", normal, normals[index]) >= gate) & trusted[face]
         index = index[good]
         found[index], valid[index], nearest[index] = normal[good], True, distance[good]
 
     everything = np.arange(len(points))
     for direction in (normals, -normals):
-        answer = scene.cast_rays(np.concatenate([points, direction], axis=1), nthreads=1)
-        distance = answer["t_hit"].numpy()
-        hit = np.flatnonzero(np.isfinite(distance))
-        accept(hit, distance[hit], answer["primitive_ids"].numpy()[hit].astype(np.int64),
-               answer["primitive_uvs"].numpy()[hit])  # fmt: skip
+        met = scene.cast(np.concatenate([points, direction], axis=1))
+        hit = np.flatnonzero(np.isfinite(met.distance))
+        accept(hit, met.distance[hit], met.faces[hit], met.uv[hit])
     missing = everything[~valid]
     if len(missing):
-        answer = scene.compute_closest_points(points[missing], nthreads=1)
-        distance = np.linalg.norm(answer["points"].numpy() - points[missing], axis=1)
-        accept(missing, distance, answer["primitive_ids"].numpy().astype(np.int64), answer["primitive_uvs"].numpy())
+        found_near = scene.nearest(points[missing])
+        distance = np.linalg.norm(found_near.points - points[missing], axis=1)
+        accept(missing, distance, found_near.faces, found_near.uv)
     return TexelNormals(found, valid)
 
 

@@ -21,7 +21,6 @@ __all__ = [
     "encode_png",
     "encode_png8",
     "flip_green",
-    "from_tangent",
     "garment_rotation",
     "to_colours",
     "to_tangent",
@@ -46,11 +45,6 @@ def garment_rotation(
 def to_tangent(normals: Float[np.ndarray, "N 3"], frames: Float[np.ndarray, "N 3 3"]) -> Float[np.ndarray, "N 3"]:
     """Global normals in tangent frames (rows tangent, bitangent, normal)."""
     return np.einsum("nrc,nc->nr", frames, normals)
-
-
-def from_tangent(normals: Float[np.ndarray, "N 3"], frames: Float[np.ndarray, "N 3 3"]) -> Float[np.ndarray, "N 3"]:
-    """Tangent-space normals in global coordinates."""
-    return np.einsum("nrc,nr->nc", frames, normals)
 
 
 def flip_green(image: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:

@@ -24,7 +24,7 @@ from torch.nn import functional
 
 from capture4d.body.skinning import PosedBody
 from capture4d.errors import InputError
-from capture4d.geometry.mesh import vertex_normals
+from capture4d.geometry.mesh import doubled_area_vectors, vertex_normals
 from capture4d.geometry.tangents import TangentLayout, interpolated_frames, uv_corners
 from capture4d.geometry.uv_layout import pack_islands, require_uvs
 from capture4d.geometry.uv_raster import UvRaster, rasterise_uv, sample_bilinear
@@ -218,8 +218,7 @@ class OffsetSampler(nn.Module):
 
 def _sides(mesh: Mesh, islands: np.ndarray) -> np.ndarray:
     """The image of each island: 0 for those that face forwards (+Z) at rest, 1 for the others."""
-    corners = mesh.vertices.astype(float)[mesh.faces]
-    vectors = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+    vectors = doubled_area_vectors(mesh.vertices.astype(float), mesh.faces) / 2
     areas = np.bincount(islands, np.linalg.norm(vectors, axis=1))
     forwards = np.bincount(islands, vectors[:, 2]) / np.maximum(areas, 1e-12)
     side = np.where(forwards > 0, 0, 1).astype(np.int32)

@@ -15,10 +15,11 @@ from jaxtyping import Bool, Float, Float16, Int
 from torch import Tensor, nn
 
 from capture4d.body.skinning import pose_frame, with_shape
+from capture4d.learning.networks import ImageDecoder
 from capture4d.settings import Count, NonNegative, Positive, Seed, settings
 from capture4d.types import Body, PoseSequence
 from wrinkles.offset_images.layout import OffsetLayout, OffsetSampler, OffsetSpace, encode
-from wrinkles.offset_images.networks import FullyConnected, ImageDecoder
+from wrinkles.offset_images.networks import FullyConnected
 
 __all__ = [
     "OffsetConfig",

@@ -15,10 +15,11 @@ from capture4d.app.compare.config import CompareConfig
 from capture4d.app.compare.garment import MB, ModelledSurface
 from capture4d.body.skinning import with_shape
 from capture4d.errors import InputError
+from capture4d.learning.networks import ImageDecoder
 from capture4d.types import Body, PoseSequence, RegisteredSequence
 from retarget.shapes.pose_normalisation import PoseRows
 from wrinkles.offset_images.layout import OffsetLayout, OffsetSampler
-from wrinkles.offset_images.networks import ImageDecoder, PcaFullyConnected
+from wrinkles.offset_images.networks import PcaFullyConnected
 from wrinkles.offset_images.training import (
     OffsetConfig,
     OffsetFrames,

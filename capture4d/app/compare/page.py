@@ -27,11 +27,8 @@ import torch
 from capture4d.app.compare.config import CompareConfig
 from capture4d.app.compare.garment import Modelled, ModelledSurface, model_take
 from capture4d.app.compare.offsets import megabytes, offset_surfaces
+from capture4d.app.drawing.palette import CLOTH, HEIGHT, SKIN, WIDTH
 from capture4d.app.drawing.panels import (
-    CLOTH,
-    HEIGHT,
-    SKIN,
-    WIDTH,
     Framing,
     Panel,
     colour_bar,

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from PIL import Image
 
+from capture4d.app.drawing.palette import CLOTH, HEIGHT, LOOP, WIDTH
 from capture4d.app.drawing.render import Direction, Drawn, View, frame_view, heat_colours, render, trace
 from capture4d.captures.capture import Capture, read_scan
 from capture4d.colours.spaces import Colour
@@ -33,10 +34,6 @@ __all__ = [
 ]
 
 VIEWS: tuple[Direction, ...] = ("three_quarter", "back")
-WIDTH, HEIGHT = 400, 370
-CLOTH = (176, 190, 208)
-SKIN = (214, 190, 172)
-LOOP = (222, 140, 28)
 WEBP = "data:image/webp;base64,"
 NO_SCAN = "no scan"
 """Title of the empty picture of a frame whose scan cannot be read."""

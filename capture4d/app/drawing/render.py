@@ -9,10 +9,11 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int32, UInt8
 
+from capture4d.colours.spaces import nearly_encoded, nearly_linear
 from capture4d.geometry.mesh import vertex_normals
+from capture4d.geometry.ray_casting import TriangleScene, barycentric
 from capture4d.geometry.tangents import TangentLayout, interpolated_frames
 from capture4d.geometry.uv_raster import sample_bilinear
-from capture4d.heavy_imports import import_open3d
 from capture4d.types import Mesh
 
 __all__ = ["Direction", "Drawn", "Traced", "View", "frame_view", "heat_colours", "render", "trace"]
@@ -159,27 +160,24 @@ def trace(
     Args:
         normal_maps: tangent-space normals for each mesh, or None for its own.
     """
-    o3d = import_open3d()
-    scene = o3d.t.geometry.RaycastingScene()
     normals, faces, first_vertex, first_face = [np.zeros((0, 3))], [np.zeros((0, 3), np.int32)], 0, [0]
     for mesh in meshes:
         normals.append(vertex_normals(mesh.vertices, mesh.faces))
         faces.append(mesh.faces + np.int32(first_vertex))
         first_vertex += len(mesh.vertices)
         if len(mesh.faces):
-            scene.add_triangles(o3d.core.Tensor(mesh.vertices), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
             first_face.append(first_face[-1] + len(mesh.faces))
     counts = tuple(len(mesh.vertices) for mesh in meshes)
     if len(first_face) == 1:
         none = np.zeros((0, 3), np.float32)
         return Traced((height, width), counts, np.zeros(0, int), none.astype(np.int32), none, none[:, 0])
     rays = _rays(view, height * SUPERSAMPLING, width * SUPERSAMPLING)
-    answer = scene.cast_rays(o3d.core.Tensor(rays))
-    hit = np.flatnonzero(np.isfinite(answer["t_hit"].numpy()))
-    face = answer["primitive_ids"].numpy()[hit] + np.array(first_face)[answer["geometry_ids"].numpy()[hit]]
+    scene = TriangleScene(*((mesh.vertices, mesh.faces) for mesh in meshes if len(mesh.faces)), threads=0)
+    hits = scene.cast(rays)
+    hit = np.flatnonzero(np.isfinite(hits.distance))
+    face = hits.faces[hit] + np.array(first_face)[hits.surfaces[hit]]
     corners = np.concatenate(faces)[face]
-    second_third = answer["primitive_uvs"].numpy()[hit]
-    weights = np.column_stack([1 - second_third.sum(axis=1), second_third])
+    weights = barycentric(hits.uv[hit])
     normal = np.einsum("nk,nkc->nc", weights, np.concatenate(normals)[corners])
     facing = -np.einsum("ij,ij->i", normal, rays[hit, 3:])
     first = 0
@@ -270,9 +268,9 @@ def _shade(normals: np.ndarray, backs: np.ndarray, view: View) -> np.ndarray:
 
 
 def _linear(srgb: np.ndarray) -> np.ndarray:
-    """Light of an 8-bit sRGB colour (a power of 2.2 is close enough for pictures)."""
-    return (srgb.astype(np.float32) / 255) ** 2.2
+    """Light of an 8-bit sRGB colour."""
+    return nearly_linear(srgb.astype(np.float32) / 255)
 
 
 def _encoded(light: np.ndarray) -> Any:
-    return (np.clip(light, 0, 1) ** (1 / 2.2) * 255 + 0.5).astype(np.uint8)
+    return (nearly_encoded(np.clip(light, 0, 1)) * 255 + 0.5).astype(np.uint8)

@@ -13,10 +13,11 @@ import jinja2
 import numpy as np
 
 from capture4d.app.drawing.charts import Line
-from capture4d.app.drawing.panels import CLOTH, SKIN, VIEWS, Framing, Panel, data_uri
+from capture4d.app.drawing.palette import BLUE, CLOTH, GREEN, GREY, HEIGHT, ORANGE, SKIN, WIDTH
+from capture4d.app.drawing.panels import VIEWS, Framing, Panel, data_uri
 from capture4d.app.drawing.render import Drawn, render
-from capture4d.app.report.metrics import column
-from capture4d.app.report.take import MAX_FLAGGED_ROWS, flat, is_current, joined_chart, shown, spread
+from capture4d.app.report.metrics import column, shown
+from capture4d.app.report.take import MAX_FLAGGED_ROWS, flat, is_current, joined_chart, spread
 from capture4d.body.skinning import pose_frame, with_shape
 from capture4d.captures.work_folder import ANIMATE, VERDICTS, WorkFolder
 from capture4d.files.atomic import write_bytes, write_json
@@ -27,8 +28,6 @@ __all__ = ["ANIMATION_METRICS", "run"]
 
 SCHEMA = 1
 PICTURES = 8
-WIDTH, HEIGHT = 400, 370
-BLUE, ORANGE, GREEN, GREY = "#2f62c9", "#d9772b", "#2f8f5b", "#8d97a5"
 
 ANIMATION_METRICS: Mapping[str, tuple[str, str, str]] = {
     "frames_good_percent": ("%", "higher", "frames with the verdict good"),

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from capture4d.app.drawing.charts import Line, line_chart
+from capture4d.app.drawing.palette import BLUE, GREY, ORANGE
 from capture4d.calibration.check import CameraCheck
 from capture4d.files.atomic import write_bytes
 
@@ -25,7 +26,6 @@ __all__ = [
     "write_page",
 ]
 
-BLUE, ORANGE, GREY = "#2f62c9", "#d9772b", "#8d97a5"
 _COLUMNS: tuple[tuple[str, str, str], ...] = (
     ("poses", "poses", "d"),
     ("corners", "corners", "d"),

@@ -23,7 +23,7 @@ from capture4d.evaluation import (
 )
 from capture4d.types import RegisteredSequence
 
-__all__ = ["METRICS", "column", "summarise", "truth_measures"]
+__all__ = ["METRICS", "column", "shown", "summarise", "truth_measures"]
 
 METRICS: Mapping[str, tuple[str, str, str]] = {
     "fit_mean_mm": ("mm", "lower", "template vertices to the scan's surface, where it has data"),
@@ -113,3 +113,12 @@ def truth_measures(
 def column(records: Sequence[Mapping[str, Any]], key: str) -> np.ndarray:
     """One number of every frame; NaN where it was not measured."""
     return np.array([math.nan if record.get(key) is None else record[key] for record in records], float)
+
+
+def shown(value: float | None) -> str:
+    """A figure as pages print it: whole numbers whole, others with three digits, a dash where there is none."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    if value == round(value) and abs(value) < 1e6:
+        return f"{value:.0f}"
+    return f"{value:.3g}"

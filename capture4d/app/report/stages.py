@@ -5,7 +5,6 @@ Each section is a value for the page's template, or None where the stage was not
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,10 +16,11 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from capture4d.app.drawing.charts import Line, line_chart
+from capture4d.app.drawing.palette import BLUE, BODY, GREEN, GREY, HEIGHT, ORANGE, WIDTH
 from capture4d.app.drawing.panels import VIEWS, Framing, Panel, data_uri, no_scan, read_panel, readable_scan
 from capture4d.app.drawing.render import Drawn, render
 from capture4d.app.report.calibration import calibration_charts, calibration_tiles
-from capture4d.app.report.metrics import column
+from capture4d.app.report.metrics import column, shown
 from capture4d.body.skinning import ShapedBody, pose_frame, with_shape
 from capture4d.captures.capture import Capture
 from capture4d.captures.garment_scans import load_garment_scan
@@ -47,9 +47,6 @@ __all__ = [
     "tracking",
 ]
 
-BLUE, ORANGE, GREEN, GREY = "#2f62c9", "#d9772b", "#2f8f5b", "#8d97a5"
-WIDTH, HEIGHT = 400, 370
-BODY = (226, 142, 84)
 LABELS = np.array([(196, 192, 186), (84, 132, 214), (250, 206, 60)], np.uint8)
 """Colours of what was cut apart: body, garment, paint."""
 LOOPS = ((214, 62, 62), (46, 150, 84), (150, 70, 190), (20, 150, 180), (230, 120, 20), (120, 90, 60))
@@ -87,9 +84,7 @@ def calibration(capture: Capture, work: Path) -> Calibration | None:
     rig = capture.rig
     if rig is None:
         return None
-    centres = -np.einsum("cba,cb->ca", rig.T_camera_world[:, :3, :3], rig.T_camera_world[:, :3, 3])
-    middle = centres.mean(axis=0)
-    away = np.linalg.norm(centres - middle, axis=1)
+    away = np.linalg.norm(rig.centres - rig.centres.mean(axis=0), axis=1)
     sizes = sorted({(int(width), int(height)) for width, height in rig.image_sizes})
     tiles = [
         (f"{len(rig.names)}", "", "cameras"),
@@ -186,7 +181,7 @@ def tracking(capture: Capture, work: Path) -> Tracking | None:
         "joint_mean_mm": ("mm", "joints to their true places"),
         "track_cpu_s": ("s", "CPU a frame, median"),
     }
-    tiles = [(_shown(metrics[key]), unit, name) for key, (unit, name) in names.items() if key in metrics]
+    tiles = [(shown(metrics[key]), unit, name) for key, (unit, name) in names.items() if key in metrics]
     unseen = Counter(limb for record in records for limb in record["unseen"]).most_common()
     return Tracking(Section(tiles, list(_tracking_charts(records))), records, metrics, unseen)
 
@@ -272,7 +267,7 @@ class _Drawing:
         if self.tracked is None:
             return None
         shaped, poses = self.tracked
-        posed = pose_frame(shaped, poses, int(np.flatnonzero(poses.frame_ids == frame_id)[0]))
+        posed = pose_frame(shaped, poses, poses.row(frame_id))
         return shaped.body.template.with_vertices(posed.vertices().astype(np.float32))
 
 
@@ -340,7 +335,3 @@ def _border_dots(path: Path, frame_id: int, loops: Sequence[np.ndarray]) -> list
 def _mean(values: np.ndarray) -> float | None:
     found = values[np.isfinite(values)]
     return float(found.mean()) if len(found) else None
-
-
-def _shown(value: float | None) -> str:
-    return "–" if value is None or not math.isfinite(value) else f"{value:.3g}"

@@ -19,8 +19,9 @@ import jinja2
 import numpy as np
 
 from capture4d.app.drawing.charts import Line, line_chart
+from capture4d.app.drawing.palette import BLUE, GREEN, GREY, ORANGE
 from capture4d.app.drawing.panels import Framing, Panel, colour_bar, draw_frame, readable_scan
-from capture4d.app.report.metrics import METRICS, column, summarise, truth_measures
+from capture4d.app.report.metrics import METRICS, column, shown, summarise, truth_measures
 from capture4d.app.report.stages import (
     Calibration,
     Comparison,
@@ -41,11 +42,10 @@ from capture4d.runs.stage import StageResult, open_stage, require_complete, resu
 from capture4d.runs.workers import run_jobs, shared
 from capture4d.settings import Count, settings
 
-__all__ = ["MAX_FLAGGED_ROWS", "ReportConfig", "flat", "is_current", "joined_chart", "run", "shown", "spread"]
+__all__ = ["MAX_FLAGGED_ROWS", "ReportConfig", "flat", "is_current", "joined_chart", "run", "spread"]
 
 SCHEMA = 3
 MAX_FLAGGED_ROWS = 60
-BLUE, ORANGE, GREEN, GREY = "#2f62c9", "#d9772b", "#2f8f5b", "#8d97a5"
 CURVES: tuple[tuple[str, float, tuple[tuple[str, str, str], ...]], ...] = (
     (
         "Fit, mm",
@@ -405,14 +405,6 @@ def is_current(folder: Path, current: Mapping[str, Any]) -> bool:
 
 def _any(records: Sequence[Mapping[str, Any]], key: str) -> bool:
     return bool(np.isfinite(column(records, key)).any())
-
-
-def shown(value: float | None) -> str:
-    if value is None or not math.isfinite(value):
-        return "–"
-    if value == round(value) and abs(value) < 1e6:
-        return f"{value:.0f}"
-    return f"{value:.3g}"
 
 
 def _round_up(value: float) -> float:

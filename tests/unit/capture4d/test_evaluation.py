@@ -8,22 +8,10 @@ from capture4d.evaluation import (
     drift_per_frame,
     drift_ratio,
     material_points,
-    scan_errors,
     truth_distances,
 )
 from capture4d.geometry.closest_points import closest_points, surface_distances
-from capture4d.types import Mesh
-
-
-def plane(size=1.0, cells=4, height=0.0):
-    """A square in the xz plane, facing +Y."""
-    side = np.linspace(0, size, cells + 1)
-    x, z = (grid.ravel() for grid in np.meshgrid(side, side, indexing="ij"))
-    vertices = np.column_stack([x, np.full(x.shape, height), z]).astype(np.float32)
-    i, j = (grid.ravel() for grid in np.meshgrid(np.arange(cells), np.arange(cells), indexing="ij"))
-    a = i * (cells + 1) + j
-    b, c, d = a + 1, a + cells + 1, a + cells + 2
-    return Mesh(vertices, np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)]).astype(np.int32))
+from tests.shapes import plane
 
 
 def test_distance_to_a_plane_is_height_inside_and_distance_to_the_rim_outside():
@@ -80,26 +68,3 @@ def test_border_errors_compare_loops_of_one_name_both_ways():
     assert len(errors) == 700
     np.testing.assert_allclose(errors, 0.1, atol=1e-3)
     assert len(border_errors({}, {"neck": circle(1.0, 10)})) == 0
-
-
-def test_scan_errors_of_a_shifted_tilted_scan_with_a_hole():
-    truth = plane(1.0, cells=8)
-    angle = np.radians(5)
-    scan = plane(1.0, cells=200)
-    tilted = scan.vertices.copy()
-    tilted[:, 1] = np.tan(angle) * (scan.vertices[:, 0] - 0.5)
-    left = (scan.vertices[scan.faces][:, :, 0] < 0.75).all(axis=1)
-    used = np.unique(scan.faces[left])
-    number = np.full(len(tilted), -1, np.int32)
-    number[used] = np.arange(len(used), dtype=np.int32)
-    part = Mesh(tilted[used], number[scan.faces[left]])
-    errors = scan_errors(part, truth, hole_gate_m=0.06)
-    assert errors.hole_share == pytest.approx(0.2, abs=0.02)  # the missing quarter, less what lies within the gate
-    np.testing.assert_allclose(errors.normal_deg, 5, atol=0.05)
-    np.testing.assert_allclose(errors.distance_m, np.abs(part.vertices[:, 1]), atol=1e-6)
-
-
-def test_the_back_of_a_sheet_counts_as_its_other_side():
-    truth = plane(1.0, cells=20)
-    back = Mesh(truth.vertices, np.ascontiguousarray(truth.faces[:, ::-1]))
-    assert scan_errors(back, truth).normal_deg.max() < 0.1

@@ -15,9 +15,10 @@ from capture4d.geometry.closest_points import surface_distances
 from capture4d.geometry.mesh import boundary_loops, face_areas
 from capture4d.types import Mesh
 from data_synth.mesh_sequence import open_sequence
-from data_synth.scan_stage import _paint, run
+from data_synth.scan_stage import paint_like, run
 from data_synth.scanner.border_paint import paint_borders
 from data_synth.scanner.config import FusionConfig, RigConfig, ScanConfig, ScannerConfig, StereoConfig
+from tests.shapes import tube_faces
 
 BLUE, YELLOW, RED = (47, 98, 201), (255, 210, 0), (229, 51, 42)
 SMALL = ScanConfig(
@@ -33,10 +34,7 @@ def skirt(bulge=0.0, rows=9, around=24):
     angle = 2 * np.pi * np.arange(around) / around
     radius = 2 - 0.5 * s + bulge * np.sin(np.pi * s)
     vertices = np.stack([radius * np.sin(angle), 6 * s + 0 * angle, radius * np.cos(angle)], axis=2).reshape(-1, 3)
-    i, j = np.meshgrid(np.arange(rows - 1), np.arange(around), indexing="ij")
-    a, b = (i * around + j).ravel(), (i * around + (j + 1) % around).ravel()
-    faces = np.concatenate([np.stack([a, b, b + around], 1), np.stack([a, b + around, a + around], 1)])
-    return Mesh(vertices.astype(np.float32), faces.astype(np.int32))
+    return Mesh(vertices.astype(np.float32), tube_faces(around, rows))
 
 
 @pytest.fixture(scope="module")
@@ -157,7 +155,7 @@ def test_borders_keep_their_paint_when_the_faces_change():
     scanner = ScannerConfig(fusion=FusionConfig(garment_voxel_m=0.2))
     config = ScanConfig(border_paint_m=0.5, border_colours=("#ffd200", "#e5332a"), scanner=scanner)
     for mesh in (first, moved):
-        sheet = _paint(mesh, first, config)
+        sheet = paint_like(mesh, first, config)
         height = sheet.posed(mesh.vertices).vertices[:, 1] - mesh.vertices[:, 1].min()
         yellow = height[(sheet.colours == YELLOW).all(axis=1)]
         red = height[(sheet.colours == RED).all(axis=1)]

@@ -17,6 +17,7 @@ from registration.config import (
     RegistrationConfig,
     Schedule,
 )
+from tests.shapes import tube_faces
 
 
 def oval_tube(around: int, along: int) -> Mesh:
@@ -26,11 +27,7 @@ def oval_tube(around: int, along: int) -> Mesh:
     ring = np.stack([radius * np.sin(angle), radius * np.cos(angle)], axis=1)
     heights = np.linspace(0, 0.5, along)
     vertices = np.concatenate([np.column_stack([ring[:, 0], np.full(around, y), ring[:, 1]]) for y in heights])
-    column, row = np.meshgrid(np.arange(around), np.arange(along - 1))
-    a, b = row * around + column, row * around + (column + 1) % around
-    lower = np.stack([a, b, b + around], -1).reshape(-1, 3)
-    upper = np.stack([a, b + around, a + around], -1).reshape(-1, 3)
-    return Mesh(vertices.astype(np.float32), np.concatenate([lower, upper]).astype(np.int32))
+    return Mesh(vertices.astype(np.float32), tube_faces(around, along))
 
 
 @pytest.fixture

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from capture4d.geometry.mesh import unique_edges
+from capture4d.geometry.point_grid import PointGrid
 from registration.correspondences import ScanSurface
 from registration.fold_lengths import edge_faces, folded_lengths
-from registration.point_grid import PointGrid
 
 
 def _sheet(size: int, spacing: float) -> tuple[np.ndarray, np.ndarray]:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from registration.config import QualityConfig
-from registration.quality import FrameQuality, assess, border_distances, count_intersecting_faces
+from registration.quality import FrameQuality, assess, border_distances
 from registration.register import prepare_frame
 from registration.template import analyse_template
 
@@ -113,27 +113,6 @@ def test_border_distances_go_both_ways(garment, scan_of, config) -> None:
     distances = border_distances(analysis, frame, analysis.rest)
     np.testing.assert_allclose(np.median(distances), 0.004, atol=5e-4)
     assert len(distances) > len(analysis.border.vertices)
-
-
-def test_intersections_equal_brute_force() -> None:
-    """Random triangles: an edge of one passes through the other, by solving for the crossing."""
-    rng = np.random.default_rng(0)
-    count = 60
-    vertices = (rng.random((count, 1, 3)) + 0.25 * rng.standard_normal((count, 3, 3))).reshape(-1, 3)
-    faces = np.arange(3 * count, dtype=np.int32).reshape(-1, 3)
-
-    def pierces(face: int, other: int) -> bool:
-        a, b, c = vertices[faces[other]]
-        for i in range(3):
-            start, end = vertices[faces[face, i]], vertices[faces[face, (i + 1) % 3]]
-            t, u, v = np.linalg.solve(np.column_stack([start - end, b - a, c - a]), start - a)
-            if 0 <= t <= 1 and u >= 0 and v >= 0 and u + v <= 1:
-                return True
-        return False
-
-    cut = {f for f in range(count) for g in range(count) if f != g and (pierces(f, g) or pierces(g, f))}
-    assert 5 < len(cut) < count
-    assert count_intersecting_faces(vertices, faces) == len(cut)
 
 
 def test_a_hidden_stretch_of_border_is_not_an_error(garment, scan_of, config) -> None:

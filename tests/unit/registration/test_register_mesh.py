@@ -118,8 +118,7 @@ def test_reasons_give_the_lengths_of_the_files_world(garment, scan_of, quick) ->
     """Limits are made for a shirt; for a thing of half its size they count half, as what they are held against does."""
     strict = replace(quick, registration=replace(quick.registration, quality=QualityConfig(fit_check_mm=1e-6)))
     template, scan = garment.template, scan_of(swell).mesh
-    for factor in (1.0, 100.0):
-        units = "m" if factor == 1.0 else "cm"
+    for units, factor in {"m": 1.0, "cm": 100.0, "in": 1 / 0.0254}.items():
         quality = register_mesh(
             scaled(template, factor), scaled(scan, factor), config=replace(strict, units=units)
         ).quality

@@ -10,8 +10,9 @@ from capture4d.body.skinning import pose_frame, skin
 from capture4d.errors import InputError
 from capture4d.types import Body, Garment, Mesh, PoseSequence
 from registration.config import SequenceConfig
+from registration.predictions import Mover, blend, choose, misfit, predict
 from registration.register import prepare_frame
-from registration.sequence import Mover, _blend, _choose, _distances, _predictions, register_run, segments
+from registration.sequence import register_run, segments
 from registration.template import analyse_template
 
 FRAMES = 6
@@ -185,8 +186,8 @@ def test_where_the_hem_lags_the_blend_is_nearer_than_both_its_parts(bound, body,
 
     before = mover.skinned(3).astype(np.float32)
     scan = prepare_frame(analysis, scan_of(place), config)
-    parts = _predictions(analysis, mover, frame, (before, 3), config)
-    name, start, _ = _choose(analysis, scan, parts, False, config)
+    parts = predict(analysis, mover, frame, (before, 3), config)
+    name, start, _ = choose(analysis, scan, parts, distant=False, config=config)
     assert name == "blended"
     assert set(parts) == {"carried", "previous", "skinned"}, "what is handed in stays"
     truth = place(analysis.rest)
@@ -205,12 +206,12 @@ def test_cloth_that_slid_without_a_trace_returns_towards_the_skinned_pose(bound,
     slid = (turn.apply(skinned - middle) + middle).astype(np.float32)
     transforms = pose_frame(mover.shaped, poses, frame).transforms
     scan = prepare_frame(analysis, scan_of(lambda points: skin(points, weights_at(points), transforms)), config)
-    parts = _predictions(analysis, mover, frame, (slid, frame), config)
-    misfits = {name: _distances(scan, part[analysis.coarse_vertices]) for name, part in parts.items()}
+    parts = predict(analysis, mover, frame, (slid, frame), config)
+    misfits = {name: misfit(scan, part[analysis.coarse_vertices]) for name, part in parts.items()}
 
     def left(relax: float) -> float:
-        blend = _blend(analysis, parts, misfits, relax)
-        return float(np.linalg.norm(blend - skinned, axis=1).mean() / np.linalg.norm(slid - skinned, axis=1).mean())
+        blended = blend(analysis, parts, misfits, relax)
+        return float(np.linalg.norm(blended - skinned, axis=1).mean() / np.linalg.norm(slid - skinned, axis=1).mean())
 
     np.testing.assert_allclose(left(0.0), 1.0, atol=1e-3)
     assert 0.5 < left(0.4) < 0.95, "a part of the way, for some of the sliding is real"

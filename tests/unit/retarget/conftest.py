@@ -15,21 +15,10 @@ from capture4d.files.records import save_body, save_garment, save_poses
 from capture4d.geometry.closest_points import closest_points
 from capture4d.geometry.mesh import boundary_loops
 from capture4d.runs.stage import open_stage
-from capture4d.types import Body, Garment, Mesh, PoseSequence, RegisteredSequence
+from capture4d.types import Body, Garment, PoseSequence, RegisteredSequence
+from tests.shapes import tube
 
 NAMES = ("root", "middle", "top")
-
-
-def tube(around: int, along: int, radius: float, height: float = 0.5, start: float = 0.0) -> Mesh:
-    """An open tube about Y, wound outwards, with UVs in metres."""
-    angle = np.tile(2 * np.pi * np.arange(around) / around, along)
-    level = np.repeat(np.linspace(start, start + height, along), around)
-    vertices = np.stack([radius * np.sin(angle), level, radius * np.cos(angle)], axis=1)
-    row, column = np.divmod(np.arange(around * (along - 1)), around)
-    a, b = row * around + column, row * around + (column + 1) % around
-    faces = np.concatenate([np.stack([a, b, b + around], 1), np.stack([a, b + around, a + around], 1)])
-    uv = np.stack([radius * angle, level], axis=1)[faces]
-    return Mesh(vertices.astype(np.float32), faces.astype(np.int32), uv.astype(np.float32))
 
 
 def bone_weights(height: np.ndarray) -> np.ndarray:

@@ -10,7 +10,6 @@ import pytest
 
 from capture4d.body.skinning import pose_frame, skin, with_shape
 from capture4d.captures.work_folder import load_moving_body, load_records, load_registration
-from capture4d.cli.main import main
 from capture4d.errors import InputError
 from capture4d.files.atomic import read_json, write_json
 from capture4d.files.records import load_body, save_body, save_garment, save_poses
@@ -19,6 +18,7 @@ from retarget.animation.stage import run as animate_poses
 from retarget.config import AnimateConfig, SplitConfig
 from retarget.regression.splits import split_takes
 from retarget.shapes.files import load_blendshapes
+from tests.command_line import fails, run
 
 QUICK = (
     "--shape.max-error-mm",
@@ -32,22 +32,6 @@ QUICK = (
     "--workers",
     "1",
 )
-
-
-def run(*arguments: str | Path) -> int:
-    with pytest.raises(SystemExit) as exit_:
-        main([str(argument) for argument in arguments])
-    return int(exit_.value.code or 0)
-
-
-def fails(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
-    """Run a command that must fail on its input; the one line it says."""
-    capsys.readouterr()
-    assert run(*arguments) == 1
-    said = capsys.readouterr().err.strip()
-    assert said.splitlines()[-1].startswith("capture4d: ")
-    assert "Traceback" not in said
-    return said.splitlines()[-1]
 
 
 @pytest.fixture(scope="module")

@@ -14,6 +14,7 @@ from capture4d.files.records import save_garment
 from capture4d.geometry.mesh import boundary_loops
 from capture4d.runs.stage import open_stage
 from capture4d.types import Garment, GarmentScan, Mesh
+from tests.shapes import tube_faces
 
 
 def sleeve(around: int, along: int) -> Mesh:
@@ -21,9 +22,7 @@ def sleeve(around: int, along: int) -> Mesh:
     angle = 2 * np.pi * np.arange(around) / around
     heights = np.linspace(0, 0.5, along)
     vertices = np.array([(0.1 * np.sin(a), y, 0.1 * np.cos(a)) for y in heights for a in angle], np.float32)
-    row, column = np.divmod(np.arange(around * (along - 1)), around)
-    a, b = row * around + column, row * around + (column + 1) % around
-    faces = np.concatenate([np.stack([a, b, b + around], 1), np.stack([a, b + around, a + around], 1)]).astype(np.int32)
+    faces = tube_faces(around, along)
     # unroll: u is arc length; the second half of the turn is a panel of its own, beside the first
     turn = angle[faces % around]
     turn = np.where((turn == 0) & (turn.max(axis=1, keepdims=True) > np.pi), 2 * np.pi, turn)
@@ -65,6 +64,11 @@ def wrinkle_normals(points: np.ndarray, height_m: float = 0.002, phase: float = 
     slope = height_m * 2 * np.pi / 0.05 * np.cos(2 * np.pi * points[:, 1:2] / 0.05 + phase)
     normal = out - slope * np.array([0, 1, 0])
     return normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+
+def from_tangent(normals: np.ndarray, frames: np.ndarray) -> np.ndarray:
+    """Tangent-space normals (N, 3) in global coordinates; frames (N, 3, 3) have rows tangent, bitangent, normal."""
+    return np.einsum("nrc,nr->nc", frames, normals)
 
 
 def some_scan(*, height_m: float = 0.002, noise_m: float = 0.0, phase: float = 0.0, seed: int = 0) -> Mesh:

@@ -32,27 +32,15 @@ from capture4d.body.motion_retarget import SMPL_TREE
 from capture4d.body.skinning import with_shape
 from capture4d.calibration.stage import DETECTOR
 from capture4d.cameras.board import parse_board
-from capture4d.cli.main import main
 from capture4d.files.atomic import write_bytes, write_npz
 from capture4d.files.meshes import write_mesh
 from capture4d.files.records import save_body, save_poses, save_rig
 from capture4d.templates.body_regions import body_region
 from capture4d.types import Mesh, PoseSequence
 from data_synth.board.views import wave_board
+from tests.command_line import fails
 
 BOARD = "charuco:10x8:80:60:DICT_5X5_100"
-
-
-def fails(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
-    """Run a command that must fail on its input; the one line it says."""
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as exit_:
-        main([str(argument) for argument in arguments])
-    said = [line for line in capsys.readouterr().err.splitlines() if " left " not in line]  # progress
-    assert exit_.value.code == 1, said
-    assert len(said) == 1
-    assert said[0].startswith("capture4d: ")
-    return said[0].removeprefix("capture4d: ")
 
 
 def motion(joint_names: tuple[str, ...], frame_ids: tuple[int, ...]) -> PoseSequence:

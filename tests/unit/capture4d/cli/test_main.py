@@ -22,23 +22,7 @@ from capture4d.files.ply import ply_bytes
 from capture4d.files.records import load_garment, save_garment, save_poses
 from capture4d.runs.stage import StageResult
 from capture4d.types import Mesh, PoseSequence
-
-
-def run(*arguments: str | Path) -> int:
-    with pytest.raises(SystemExit) as exit_:
-        main([str(argument) for argument in arguments])
-    return int(exit_.value.code or 0)
-
-
-def fails(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
-    """Run a command that must fail on its input; the one line it says."""
-    capsys.readouterr()
-    assert run(*arguments) == 1
-    said = capsys.readouterr().err.strip()
-    line = said.splitlines()[-1]
-    assert line.startswith("capture4d: ")
-    assert "Traceback" not in said
-    return line
+from tests.command_line import fails, run
 
 
 def still_poses(frames: tuple[int, ...]) -> PoseSequence:

@@ -22,6 +22,7 @@ from capture4d.geometry.mesh import vertex_normals
 from capture4d.tracking.config import SamplingConfig
 from capture4d.tracking.scan_points import ScanPoints, scan_points
 from capture4d.types import Mesh, Scan
+from tests.shapes import tube_faces
 
 AROUND, ALONG = 140, 160
 PALETTES = {  # cloth, paint, suit, skin
@@ -44,10 +45,7 @@ def dressed_tube(
     vertices = np.stack(
         [radius * np.sin(angle), np.broadcast_to(height, radius.shape), radius * np.cos(angle)], axis=-1
     ).reshape(-1, 3)
-    row, column = np.divmod(np.arange((ALONG - 1) * AROUND), AROUND)
-    a, b = row * AROUND + column, row * AROUND + (column + 1) % AROUND
-    faces = np.concatenate([np.stack([a, b, b + AROUND], 1), np.stack([a, b + AROUND, a + AROUND], 1)])
-    mesh = Mesh(vertices.astype(np.float32), faces.astype(np.int32))
+    mesh = Mesh(vertices.astype(np.float32), tube_faces(AROUND, ALONG))
     y = vertices[:, 1]
     colours = np.full((len(y), 3), suit, float)
     colours[(y > 0) & (y < 0.4)] = cloth

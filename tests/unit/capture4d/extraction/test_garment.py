@@ -7,6 +7,7 @@ from capture4d.colours.labels import classify_colours
 from capture4d.errors import InputError
 from capture4d.extraction.garment import ColourNotFoundError, extract_garment
 from capture4d.types import Mesh, Scan
+from tests.shapes import tube_faces
 
 CLOTH, TOP, BOTTOM, SUIT = (47, 98, 201), (255, 196, 0), (229, 51, 42), (150, 152, 156)
 AROUND, ALONG, BAND = 200, 120, 0.012
@@ -18,11 +19,7 @@ def painted_tube(rng: np.random.Generator, *, holes: int = 0, bottom: tuple[int,
     heights = np.linspace(-0.1, 0.3, ALONG)
     ring = np.stack([0.1 * np.sin(angle), 0.1 * np.cos(angle)], axis=1)
     vertices = np.concatenate([np.column_stack([ring[:, 0], np.full(AROUND, y), ring[:, 1]]) for y in heights])
-    column, row = np.meshgrid(np.arange(AROUND), np.arange(ALONG - 1))
-    a, b = row * AROUND + column, row * AROUND + (column + 1) % AROUND
-    faces = np.concatenate(
-        [np.stack([a, b, b + AROUND], -1).reshape(-1, 3), np.stack([a, b + AROUND, a + AROUND], -1).reshape(-1, 3)]
-    )
+    faces = tube_faces(AROUND, ALONG)
     y = vertices[:, 1]
     colours = np.full((len(vertices), 3), SUIT, float)
     colours[y >= 0] = CLOTH
@@ -35,7 +32,7 @@ def painted_tube(rng: np.random.Generator, *, holes: int = 0, bottom: tuple[int,
     for _ in range(holes):
         centre = np.array([*ring[rng.integers(AROUND)], 0])[[0, 2, 1]] + [0, rng.uniform(0, 0.02), 0]
         keep &= np.linalg.norm(vertices[faces].mean(axis=1) - centre, axis=1) > 0.006
-    mesh = Mesh(vertices.astype(np.float32), faces[keep].astype(np.int32))
+    mesh = Mesh(vertices.astype(np.float32), faces[keep])
     return Scan(mesh, np.clip(colours, 0, 255).astype(np.uint8), 3, 0.0)
 
 

@@ -7,48 +7,45 @@ from capture4d.geometry.mesh import (
     boundary_edges,
     boundary_loops,
     connected_components,
+    doubled_area_vectors,
+    edge_uses,
+    edges_of_faces,
     face_areas,
-    face_normals,
+    half_edges,
+    normalised,
     submesh,
     unique_edges,
     vertex_adjacency,
     vertex_normals,
 )
 from capture4d.types import Mesh
+from tests import shapes
 
 
-def tube(around: int = 12, along: int = 5, radius: float = 0.5) -> Mesh:
-    """An open cylinder about Z, wound outwards: two border loops of `around` vertices."""
-    angle = 2 * np.pi * np.arange(around) / around
-    ring = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
-    vertices = np.concatenate([np.column_stack([ring, np.full(around, z)]) for z in np.linspace(0, 1, along)])
-    column, row = np.meshgrid(np.arange(around), np.arange(along - 1))
-    a, b = row * around + column, row * around + (column + 1) % around
-    faces = np.concatenate(
-        [np.stack([a, b, b + around], -1).reshape(-1, 3), np.stack([a, b + around, a + around], -1).reshape(-1, 3)]
-    )
-    return Mesh(vertices.astype(np.float32), faces.astype(np.int32))
+def tube(around: int = 12, along: int = 5) -> Mesh:
+    """An open cylinder, 1 across and 1 high: two border loops of `around` vertices."""
+    return shapes.tube(around, along, 0.5, 1.0)
 
 
-def test_normals_are_unit_and_point_outwards():
+def test_area_vectors_are_as_long_as_twice_the_area_and_point_outwards():
     mesh = tube()
-    normals = face_normals(mesh.vertices, mesh.faces)
+    normals = doubled_area_vectors(mesh.vertices, mesh.faces)
     centres = mesh.vertices[mesh.faces].mean(axis=1)
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6)
-    assert (np.einsum("fd,fd->f", normals[:, :2], centres[:, :2]) > 0).all()
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 2 * face_areas(mesh.vertices, mesh.faces), rtol=1e-6)
+    assert (np.einsum("fd,fd->f", normals, centres * [1, 0, 1]) > 0).all()
 
 
 def test_vertex_normals_of_a_tube_are_radial_away_from_its_borders():
     mesh = tube(around=64, along=9)
     inner = slice(64, -64)
-    radial = mesh.vertices[inner] * [1, 1, 0] / 0.5
+    radial = mesh.vertices[inner] * [1, 0, 1] / 0.5
     np.testing.assert_allclose(vertex_normals(mesh.vertices, mesh.faces)[inner], radial, atol=2e-3)
 
 
 def test_a_face_without_area_has_no_normal():
     vertices = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0]], np.float32)
     faces = np.array([[0, 1, 2]], np.int32)
-    assert not face_normals(vertices, faces).any()
+    assert not normalised(doubled_area_vectors(vertices, faces)).any()
     assert not vertex_normals(vertices, faces).any()
     assert face_areas(vertices, faces) == pytest.approx(0)
 
@@ -64,6 +61,19 @@ def test_edges_satisfy_euler():
     assert len(mesh.vertices) - len(edges) + len(mesh.faces) == 0  # a tube
     assert (edges[:, 0] < edges[:, 1]).all()
     assert len(np.unique(edges, axis=0)) == len(edges)
+
+
+def test_sides_of_faces_are_found_among_the_edges_and_counted():
+    mesh = tube(around=10, along=4)
+    edges, uses = edge_uses(mesh.faces)
+    np.testing.assert_array_equal(edges, unique_edges(mesh.faces))
+    found = edges_of_faces(mesh.faces, edges)
+    for face, row in zip(mesh.faces.tolist(), found, strict=True):
+        for corner in range(3):
+            assert set(edges[row[corner]].tolist()) == {face[corner], face[(corner + 1) % 3]}
+    np.testing.assert_array_equal(np.bincount(found.ravel()), uses)
+    assert sorted(edges[uses == 1].ravel().tolist()) == sorted(2 * [*range(10), *range(30, 40)])
+    assert half_edges(mesh.faces)[:3].tolist() == [[0, 1], [1, 11], [11, 0]]
 
 
 def test_loops_of_a_tube_are_its_two_rings_in_walking_order():

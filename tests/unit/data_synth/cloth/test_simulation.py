@@ -12,7 +12,7 @@ from capture4d.geometry.mesh import unique_edges
 from data_synth.cloth.patterns import mesh_pattern, tshirt_pattern
 from data_synth.cloth.simulation import approach_poses, dress, simulate
 from data_synth.cloth.template import bind_template
-from data_synth.cloth.wrinkle_relaxation import body_planes
+from data_synth.cloth.wrinkle_relaxation import BodySurface
 from data_synth.config import Fabric, GarmentStyle, MotionConfig, SimulationConfig
 from data_synth.motions import make_motion
 
@@ -38,7 +38,7 @@ def test_no_edge_of_the_hung_panels_runs_through_the_body(person: ShapedBody, ea
     body = approach_poses(person, poses, SETTINGS)[0]
     start, end = dress(person, mesh, pattern, body)[unique_edges(mesh.faces)].transpose(1, 0, 2)
     samples = np.concatenate([start + share * (end - start) for share in np.linspace(0, 1, 9)])
-    planes = body_planes(samples, body.vertices(), person.body.template.faces)
+    planes = BodySurface.create(body.vertices(), person.body.template.faces).planes(samples)
     depth = -np.einsum("vc,vc->v", samples - planes.points, planes.normals)
     assert depth.max() < 0.015, "limbs are tubes of 45 mm radius: deeper, and the edge runs through them"
 

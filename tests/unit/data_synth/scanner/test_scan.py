@@ -6,12 +6,14 @@ import pytest
 
 from capture4d.errors import InputError
 from capture4d.geometry.mesh import vertex_normals
+from capture4d.geometry.ray_casting import TriangleScene
 from capture4d.types import Mesh, Rig
 from data_synth.scanner.config import FusionConfig, NoiseConfig, ScannerConfig, ShadingConfig
 from data_synth.scanner.fusion import canonical_order, drop_small_components
 from data_synth.scanner.raycast import NOTHING, Surface, SurfaceScene
 from data_synth.scanner.rig import capture_rig, look_at
 from data_synth.scanner.scan import LABEL_BORDER, LABEL_GARMENT, scan_surfaces
+from tests.shapes import tube_faces
 
 PERFECT = ScannerConfig(
     noise=NoiseConfig(sigma_m=0.0, silhouette_step_m=0.04, weak_loss=0.0, blob_loss=0.0),
@@ -27,10 +29,7 @@ def swept(girth, height, around):
     angle = 2 * np.pi * np.arange(around) / around
     rings = girth[:, None] * np.sin(angle), height[:, None] + 0 * angle, girth[:, None] * np.cos(angle)
     vertices = np.stack(rings, axis=2).reshape(-1, 3)
-    i, j = np.meshgrid(np.arange(along - 1), np.arange(around), indexing="ij")
-    a, b = (i * around + j).ravel(), (i * around + (j + 1) % around).ravel()
-    faces = np.concatenate([np.stack([a, b, b + around], 1), np.stack([a, b + around, a + around], 1)])
-    return Mesh(vertices.astype(np.float32), faces.astype(np.int32))
+    return Mesh(vertices.astype(np.float32), tube_faces(around, along))
 
 
 def tube(length, *, radius=RADIUS, around=96, along=60):
@@ -165,19 +164,19 @@ def test_small_pieces_are_dropped():
 
 def test_coarse_tiles_miss_nothing():
     """Against rays through every pixel of the image."""
-    scene = SurfaceScene([painted(tube(0.2)), painted(sphere(0.06), label=0)])
+    surfaces = [painted(tube(0.2)), painted(sphere(0.06), label=0)]
+    scene = SurfaceScene(surfaces)
+    triangles = TriangleScene(*((surface.mesh.vertices, surface.mesh.faces) for surface in surfaces))
     rig = capture_rig(centre=(0.0, 0.0, 0.0), radius=0.22, cameras=8, image_size=100)  # not a multiple of the tile
     for camera in range(8):
         images = scene.view(rig, camera)
         whole = np.full((100, 100), NOTHING, np.uint8)
         top, left = images.origin
         whole[top : top + images.surface.shape[0], left : left + images.surface.shape[1]] = images.surface
-        from data_synth.scanner.raycast import _rays, _tensor
-
-        v, u = (index.ravel().astype(np.float32) for index in np.indices((100, 100)))
-        answer = scene._scene.cast_rays(_tensor(_rays(rig, camera, u, v)))
-        hit = np.isfinite(answer["t_hit"].numpy()).reshape(100, 100)
-        np.testing.assert_array_equal(whole != NOTHING, hit)
+        rotation, pixels = rig.T_camera_world[camera, :3, :3], np.indices((100, 100))[::-1].reshape(2, -1)
+        directions = np.linalg.inv(rig.intrinsics[camera]) @ np.vstack([pixels, np.ones(10_000)])
+        rays = np.column_stack([np.tile(rig.centres[camera], (10_000, 1)), directions.T @ rotation])
+        np.testing.assert_array_equal(whole != NOTHING, triangles.is_met(rays).reshape(100, 100))
 
 
 def test_bad_input_is_named():

@@ -9,12 +9,13 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from capture4d.learning.kernels import likeness
 from capture4d.types import PoseSequence
 from retarget.config import ControlConfig, KernelConfig, KernelTuningConfig
 from retarget.regression.controls import ControlLayout, control_vectors
 from retarget.regression.kernel import KernelRegressor, fit_kernel
 from retarget.regression.kernel_tuning import Fold
-from retarget.regression.kernel_views import kernel_views, likeness
+from retarget.regression.kernel_views import kernel_views
 from retarget.regression.regressors import Clip, FittingClips, mean_squared_error
 
 NAMES = ("root", "spine", "arm.L", "arm.R", "neck")

@@ -71,7 +71,7 @@ def test_reading_block_by_block_changes_nothing(monkeypatch: pytest.MonkeyPatch)
     weights = np.ones(frames.shape[:2])
     weights[3:9, :7] = 0.0
     whole = [learned(frames, weights, method=method) for method in ("exact", "randomised")]
-    monkeypatch.setattr("retarget.shapes.principal_directions.BLOCK_NUMBERS", 7 * frames[0].size)
+    monkeypatch.setattr("capture4d.learning.principal_directions.BLOCK_NUMBERS", 7 * frames[0].size)
     for method, expected in zip(("exact", "randomised"), whole, strict=True):
         found = learned(frames, weights, method=method)
         np.testing.assert_allclose(found.basis, expected.basis, atol=1e-8)

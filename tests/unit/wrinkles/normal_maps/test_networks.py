@@ -8,7 +8,7 @@ import torch
 
 from wrinkles.normal_maps.config import PRESETS, MapConfig, NetworkConfig
 from wrinkles.normal_maps.inference import WrinkleModel
-from wrinkles.normal_maps.networks import PatchDiscriminator, UNet, receptive_field, set_test_statistics
+from wrinkles.normal_maps.networks import PatchDiscriminator, UNet, set_test_statistics
 
 PAPER = NetworkConfig()
 SMALL = NetworkConfig(filters=4, layers=5, output="residual", dropout=0.0)
@@ -16,6 +16,14 @@ SMALL = NetworkConfig(filters=4, layers=5, output="residual", dropout=0.0)
 
 def parameters(network: torch.nn.Module) -> int:
     return sum(each.numel() for each in network.parameters())
+
+
+def receptive_field(network: torch.nn.Module) -> int:
+    """Side of the input patch that one output of a chain of convolutions sees."""
+    side = 1
+    for layer in reversed([each for each in network.modules() if isinstance(each, torch.nn.Conv2d)]):
+        side = (side - 1) * layer.stride[0] + layer.kernel_size[0]
+    return side
 
 
 def test_the_paper_s_networks_have_the_known_numbers_of_parameters():

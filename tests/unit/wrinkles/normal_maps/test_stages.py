@@ -16,38 +16,29 @@ import safetensors.torch
 import torch
 from scipy.spatial.transform import Rotation
 
-from capture4d.cli.main import main
 from capture4d.files.atomic import write_bytes, write_npy, write_npz
 from capture4d.files.records import load_garment, save_garment
 from capture4d.geometry.mesh import submesh
 from capture4d.runs.stage import open_stage
 from capture4d.types import Garment, Mesh
-from tests.unit.wrinkles.conftest import make_work, outside_the_unit_square, some_garment, some_scan, wrinkle_normals
+from tests.command_line import fails, run
+from tests.unit.wrinkles.conftest import (
+    from_tangent,
+    make_work,
+    outside_the_unit_square,
+    some_garment,
+    some_scan,
+    wrinkle_normals,
+)
 from wrinkles.normal_maps import train_stage
 from wrinkles.normal_maps.config import MapConfig
 from wrinkles.normal_maps.display import fill_holes
-from wrinkles.normal_maps.spaces import decode_png, encode_png, from_tangent
+from wrinkles.normal_maps.spaces import decode_png, encode_png
 from wrinkles.normal_maps.template import MapTemplate
 
 SMALL = ["--pairs.map.size", "64", "--texels", "32", "--network.filters", "4", "--network.layers", "5",
          "--schedule.steps", "6", "--schedule.checkpoint-every", "2", "--schedule.sample-every", "3",
          "--schedule.log-every", "2", "--schedule.batch", "2", "--held-out", "0.2", "--workers", "1"]  # fmt: skip
-
-
-def run(*arguments: str | Path) -> int:
-    with pytest.raises(SystemExit) as exit_:
-        main([str(argument) for argument in arguments])
-    return int(exit_.value.code or 0)
-
-
-def fails(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
-    capsys.readouterr()
-    assert run(*arguments) == 1
-    said = capsys.readouterr().err.strip()
-    assert "Traceback" not in said
-    line = said.splitlines()[-1]
-    assert line.startswith("capture4d: ")
-    return line
 
 
 def train(work: Path, model: Path, *more: str) -> tuple[str | Path, ...]:
@@ -140,7 +131,8 @@ def test_an_animation_borrows_the_high_maps_of_the_take_it_follows(
     size = ("--map.size", "64", "--workers", "1")
     animated = turned_copy(work, tmp_path / "animated", [2, 3, 9])
     arguments = ("wrinkles", "maps", animated, "--high-from", work, *size)
-    assert "not finished" in fails(capsys, *arguments) or "run: capture4d wrinkles maps" in fails(capsys, *arguments)
+    missing = f"{work / 'wrinkles' / 'pairs'}: expected the output of 'pairs', found none"
+    assert fails(capsys, *arguments) == f"{missing}; run: capture4d wrinkles maps {work}"
     assert run("wrinkles", "maps", work, *size) == 0
     assert run(*arguments) == 0
     theirs, ours = work / "wrinkles" / "pairs", animated / "wrinkles" / "pairs"

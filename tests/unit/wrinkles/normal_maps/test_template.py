@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 from capture4d.errors import InputError
 from capture4d.geometry.mesh import submesh
 from capture4d.types import Garment, Mesh
-from tests.unit.wrinkles.conftest import wrinkle_normals
+from tests.unit.wrinkles.conftest import from_tangent, wrinkle_normals
 from wrinkles.normal_maps.config import MapConfig, ProjectionConfig
 from wrinkles.normal_maps.scan_normals import project_scan
-from wrinkles.normal_maps.spaces import from_tangent, garment_rotation, to_tangent
+from wrinkles.normal_maps.spaces import garment_rotation, to_tangent
 from wrinkles.normal_maps.template import MapTemplate, frame_pairs, temporal_window
 
 SINGLE = ProjectionConfig(temporal_frames=1, smoothing_passes=0, blur_texels=0.0)

@@ -8,10 +8,11 @@ import torch
 
 from capture4d.body.skinning import PosedBody, with_pose, with_shape
 from capture4d.errors import InputError
+from capture4d.learning.networks import ImageDecoder
 from capture4d.types import Body, Garment, Mesh, PoseSequence
 from tests.unit.wrinkles.conftest import sleeve, wrinkled
 from wrinkles.offset_images.layout import Anchors, OffsetLayout, OffsetSampler, decode, encode
-from wrinkles.offset_images.networks import FullyConnected, ImageDecoder, PcaFullyConnected
+from wrinkles.offset_images.networks import FullyConnected, PcaFullyConnected
 from wrinkles.offset_images.training import (
     OffsetConfig,
     grid_loss,

@@ -21,18 +21,9 @@ from capture4d.files.records import save_body, save_garment, save_poses
 from capture4d.geometry.mesh import boundary_loops
 from capture4d.runs.stage import StageResult, open_stage
 from capture4d.types import Garment, Mesh, PoseSequence, Scan
+from tests.shapes import tube
 
 FRAMES = 8
-
-
-def tube(rows=12, around=20):
-    angle = 2 * np.pi * np.arange(around) / around
-    height = np.linspace(0, 0.6, rows)[:, None] + 0 * angle
-    vertices = np.stack([0.2 * np.sin(angle) + 0 * height, height, 0.2 * np.cos(angle) + 0 * height], axis=2)
-    i, j = np.meshgrid(np.arange(rows - 1), np.arange(around), indexing="ij")
-    a, b = (i * around + j).ravel(), (i * around + (j + 1) % around).ravel()
-    faces = np.concatenate([np.stack([a, b, b + around], 1), np.stack([a, b + around, a + around], 1)])
-    return Mesh(vertices.reshape(-1, 3).astype(np.float32), faces.astype(np.int32))
 
 
 def record(index, **changes):
@@ -45,7 +36,7 @@ def record(index, **changes):
 @pytest.fixture
 def work(tmp_path):
     """A finished registration that lies a growing distance above the truth, whose scan is the truth."""
-    mesh = tube()
+    mesh = tube(20, 12, 0.2, 0.6)
     loops = {f"border_{i}": loop for i, loop in enumerate(boundary_loops(mesh.faces))}
     capture = Capture(tmp_path / "capture", "tube", 60.0, tuple(range(FRAMES)), (47, 98, 201), {})
     write_capture_description(capture)

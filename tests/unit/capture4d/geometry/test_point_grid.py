@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from registration import point_grid
-from registration.point_grid import PointGrid
+from capture4d.geometry import point_grid
+from capture4d.geometry.point_grid import PointGrid
 
 
 @pytest.mark.parametrize("cell", [0.003, 0.02, 0.5])

@@ -1,4 +1,4 @@
-"""Taking a garment out of the body it is on.
+"""Taking a surface out of a closed one: a garment out of the body it is on.
 
 What is moved is chosen here: vertices behind the body's surface, and, where the body pokes through a face whose corners
 are all outside, those corners. The rest follows by sparse least squares over the displacement d,
@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int32
@@ -22,10 +23,9 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from capture4d.geometry.mesh import vertex_adjacency, vertex_normals
-from capture4d.heavy_imports import import_open3d
-from retarget.config import RemovalConfig
+from capture4d.geometry.ray_casting import TriangleScene, barycentric
 
-__all__ = ["BodySurface", "IntersectionRemoval", "Penetration", "Removed"]
+__all__ = ["ClosedSurface", "IntersectionRemoval", "Penetration", "RemovalSettings", "Removed"]
 
 EDGE_MIDDLES = np.array([[1, 1, 0], [0, 1, 1], [1, 0, 1], [2 / 3, 2 / 3, 2 / 3]]) / 2
 """Where a face is probed: the middles of its edges, and its own."""
@@ -36,43 +36,66 @@ TOLERANCE, MOST_STEPS = 1e-6, 200
 """Relative residual at which conjugate gradients stop; the preconditioner leaves them a condition of `leave`/`stay`."""
 
 
+@runtime_checkable
+class RemovalSettings(Protocol):
+    """What a stage's own settings have to say."""
+
+    @property
+    def enabled(self) -> bool:
+        """Off, nothing moves, and what is inside is only measured."""
+        ...
+
+    @property
+    def margin_mm(self) -> float:
+        """How far outside vertices are put."""
+        ...
+
+    @property
+    def stay(self) -> float: ...
+
+    @property
+    def leave(self) -> float: ...
+
+    @property
+    def rounds(self) -> int: ...
+
+    @property
+    def faces(self) -> bool:
+        """Also where the closed surface pokes through a face whose corners are all outside."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class Penetration:
     """How much of the garment is inside the body."""
 
     inside_percent: float
     """Vertices behind the surface."""
-    depth_mean_mm: float
-    """Of those; 0 if there are none."""
     depth_max_mm: float
+    """Of the deepest; 0 if there are none."""
 
     @staticmethod
     def of(heights_m: Float[np.ndarray, " verts"]) -> Penetration:
         depths = -1e3 * heights_m[heights_m < 0]
-        if not len(depths):
-            return Penetration(0.0, 0.0, 0.0)
-        return Penetration(100.0 * len(depths) / len(heights_m), float(depths.mean()), float(depths.max()))
+        return Penetration(100.0 * len(depths) / max(len(heights_m), 1), float(depths.max(initial=0.0)))
 
 
-class BodySurface:
-    """A posed body to measure heights over. Normals are interpolated, so that they do not jump at edges."""
+class ClosedSurface:
+    """A posed body, say, to measure heights over. Normals are interpolated, so that they do not jump at edges."""
 
     def __init__(self, vertices: Float[np.ndarray, "skin 3"], faces: Int32[np.ndarray, "faces 3"]) -> None:
-        self._scene = import_open3d().t.geometry.RaycastingScene(nthreads=1)
-        self._scene.add_triangles(vertices.astype(np.float32), faces.astype(np.uint32))
+        self._scene = TriangleScene((vertices, faces))
         self._faces, self._normals = faces, vertex_normals(vertices.astype(np.float64), faces)
 
     def heights(
         self, points: Float[np.ndarray, "points 3"]
     ) -> tuple[Float64[np.ndarray, " points"], Float64[np.ndarray, "points 3"]]:
         """Height over the nearest point of the surface, metres, negative inside; and the normal there."""
-        closest = self._scene.compute_closest_points(np.ascontiguousarray(points, np.float32))
-        uv = closest["primitive_uvs"].numpy().astype(np.float64)
-        weights = np.column_stack([1 - uv.sum(axis=1), uv])
-        corners = self._normals[self._faces[closest["primitive_ids"].numpy().astype(np.int64)]]
-        normals = np.einsum("pk,pkx->px", weights, corners)
+        nearest = self._scene.nearest(points)
+        corners = self._normals[self._faces[nearest.faces]]
+        normals = np.einsum("pk,pkx->px", barycentric(nearest.uv.astype(np.float64)), corners)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-        apart = points - closest["points"].numpy().astype(np.float64)
+        apart = points - nearest.points.astype(np.float64)
         return np.linalg.norm(apart, axis=1) * np.sign(np.einsum("px,px->p", apart, normals)), normals
 
 
@@ -96,7 +119,7 @@ class Removed:
 class IntersectionRemoval:
     """The least squares of one topology, factorised once; one call a frame."""
 
-    def __init__(self, faces: Int32[np.ndarray, "faces 3"], count: int, config: RemovalConfig) -> None:
+    def __init__(self, faces: Int32[np.ndarray, "faces 3"], count: int, config: RemovalSettings) -> None:
         self._faces, self._config = faces, config
         adjacency = vertex_adjacency(faces, count).astype(np.float64)
         degree = np.asarray(adjacency.sum(axis=1)).ravel()
@@ -105,7 +128,7 @@ class IntersectionRemoval:
         self._stiffness = (laplacian.T @ laplacian).tocsr()
         self._factor = splu((self._stiffness + config.stay * sparse.eye_array(count)).tocsc())
 
-    def __call__(self, vertices: Float[np.ndarray, "verts 3"], body: BodySurface) -> Removed:
+    def __call__(self, vertices: Float[np.ndarray, "verts 3"], body: ClosedSurface) -> Removed:
         """Move a garment, metres, out of a body."""
         config, margin = self._config, 1e-3 * self._config.margin_mm
         start = vertices.astype(np.float64)
@@ -139,7 +162,7 @@ class IntersectionRemoval:
         points: np.ndarray,
         heights: np.ndarray,
         push: np.ndarray,
-        body: BodySurface,
+        body: ClosedSurface,
         margin: float,
         bulge: np.ndarray,
     ) -> np.ndarray:

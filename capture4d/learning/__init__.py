@@ -1,0 +1,1 @@
+"""Regression and networks that several wings learn with: arrays and tensors in, arrays and tensors out."""
