@@ -43,6 +43,7 @@ def run_demo(output: Path, *, workers: int, overwrite: bool = False) -> tuple[Pa
     from capture4d.app.compare.page import run as compare
     from data_synth.config import PRESETS
     from data_synth.stage import run as synthesise
+    from retarget.animation.stage import Wearer
     from retarget.animation.stage import run as animate
     from retarget.config import AnimateConfig, FitConfig, TrainingConfig
     from retarget.fit_stage import run as fit
@@ -65,7 +66,7 @@ def run_demo(output: Path, *, workers: int, overwrite: bool = False) -> tuple[Pa
         output / "body" / "poses.npz",
         output / "other",
         AnimateConfig(),
-        beta=OTHER_PERSON,
+        wearer=Wearer(beta=OTHER_PERSON),
         workers=workers,
         overwrite=overwrite,
     )

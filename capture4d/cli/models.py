@@ -62,15 +62,14 @@ class Animate(GradedOptions):
     config: Annotated[AnimateConfig, arg(name="")] = field(default_factory=AnimateConfig)
 
     def __call__(self) -> int:
-        from retarget.animation.stage import run
+        from retarget.animation.stage import Wearer, run
 
         result = run(
             self.model,
             self.poses,
             self.output,
             self.config,
-            body=self.body,
-            beta=self.beta,
+            wearer=Wearer(self.body, self.beta),
             device=self.device,
             workers=self.workers,
             overwrite=self.overwrite,
