@@ -37,7 +37,7 @@ from benchmarks.learning_takes import learned_takes, registered_takes, training_
 from benchmarks.metric import Metric
 from benchmarks.renewal import renew
 from capture4d.body.skinning import with_shape
-from capture4d.captures.work_folder import load_moving_body, load_registration
+from capture4d.captures.work_folder import load_registration, open_work
 from capture4d.errors import InputError
 from capture4d.files.records import save_body, save_poses
 from retarget.animation.garment_model import load_garment_model
@@ -226,13 +226,14 @@ def _answers(
     model_folder = folder / "model" / "retarget"
     shape = ShapeConfig(components=max(bases.values()))
     split = SplitConfig(validation_share=validation_share)
-    fit(clips.train, model_folder, FitConfig(regressor="kernel", shape=shape, split=split), workers=workers)
+    works = [open_work(work) for work in clips.train]
+    fit(works, model_folder, FitConfig(regressor="kernel", shape=shape, split=split), workers=workers)
     known = load_garment_model(model_folder)
     captured, config = known.person(), AnimateConfig(removal=RemovalConfig(enabled=False))
     placed: dict[Path, dict[str, Path]] = {}
     for work in clips.all:
         sequence = load_registration(work / "registration")
-        body, poses = load_moving_body(work)
+        body, poses = open_work(work).require_posed_body()
         rows = PoseRows.match(sequence, with_shape(body, poses.shape), poses)
         unposed = unpose_sequence(sequence, rows, captured.shape, unseen_weight=shape.unseen_weight)
         frames, weights = (np.stack(each) for each in zip(*unposed, strict=True))

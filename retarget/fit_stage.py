@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from capture4d.body.binding import with_body_shape
+from capture4d.captures.work_folder import WorkFolder
 from capture4d.errors import InputError
 from capture4d.files.atomic import read_json, write_json
 from capture4d.files.records import save_body
@@ -76,7 +77,7 @@ class _Lesson:
 
 
 def run(
-    works: Sequence[Path],
+    works: Sequence[WorkFolder],
     output: Path,
     config: FitConfig,
     *,
@@ -94,12 +95,12 @@ def run(
             few good frames.
     """
     check_fit(config)
-    works = sorted(works, key=lambda work: work.resolve().name)
-    names = [work.resolve().name for work in works]
+    works = sorted(works, key=lambda work: work.path.resolve().name)
+    names = [work.path.resolve().name for work in works]
     if len(set(names)) != len(names):
         raise InputError(f"takes: expected work folders of different names, found {', '.join(sorted(names))}")
     upstream = {
-        name: require_complete(work / "registration", "register", f"capture4d run CAPTURE --output {work}")
+        name: require_complete(work.path / "registration", "register", f"capture4d run CAPTURE --output {work.path}")
         for name, work in zip(names, works, strict=True)
     }
     takes = read_takes(works)

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from capture4d.body.skinning import with_shape
-from capture4d.captures.work_folder import VERDICTS, load_moving_body, load_records, load_registration
+from capture4d.captures.work_folder import VERDICTS, WorkFolder, load_registration
 from capture4d.errors import InputError
 from capture4d.files.atomic import read_json, write_json, write_npy, write_npy_rows
 from capture4d.files.records import load_garment
@@ -33,43 +33,40 @@ SAME_WEIGHTS = 1e-3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RegisteredTake:
-    """A take without its frames, which are many."""
+    """A take, its frames still unread, for they are many."""
 
-    name: str
-    registration: Path
-    """WORK/registration, where they are."""
+    work: WorkFolder
     garment: Garment
     body: Body
     poses: PoseSequence
 
+    @property
+    def name(self) -> str:
+        return self.work.path.resolve().name
 
-def read_takes(works: Sequence[Path]) -> list[RegisteredTake]:
+
+def read_takes(works: Sequence[WorkFolder]) -> list[RegisteredTake]:
     """Takes of one garment on one body.
 
     Raises:
         InputError: they do not fit together; names the first that does not.
     """
     takes = [_read_take(work) for work in works]
-    for work, take in zip(works, takes, strict=True):
+    for take in takes:
         try:
-            _require_alike(take, takes[0], works[0])
+            _require_alike(take, takes[0])
         except InputError as error:
-            raise error.at(work) from None
+            raise error.at(take.work.path) from None
     return takes
 
 
-def _read_take(work: Path) -> RegisteredTake:
-    body, poses = load_moving_body(work)
-    garment = load_garment(work / "registration" / "garment.npz")
-    return RegisteredTake(work.resolve().name, work / "registration", garment, body, poses)
+def _read_take(work: WorkFolder) -> RegisteredTake:
+    body, poses = work.require_posed_body()
+    return RegisteredTake(work, load_garment(work.path / "registration" / "garment.npz"), body, poses)
 
 
-def _require_alike(take: RegisteredTake, first: RegisteredTake, where: Path) -> None:
-    """
-    Args:
-        where: the work folder of the first.
-    """
-    body, poses, template = take.body, take.poses, take.garment.template
+def _require_alike(take: RegisteredTake, first: RegisteredTake) -> None:
+    where, body, poses, template = first.work.path, take.body, take.poses, take.garment.template
     if body.joint_names != first.body.joint_names or not np.array_equal(body.template.faces, first.body.template.faces):
         raise InputError(f"expected the body of {where}, found another skeleton or mesh")
     if abs(poses.fps - first.poses.fps) > 1e-3 * first.poses.fps:
@@ -125,7 +122,7 @@ def _weights_path(folder: Path, take: RegisteredTake) -> Path:
 
 
 def _unpose_take(folder: Path, unseen_weight: float, person: np.ndarray, take: RegisteredTake) -> None:
-    registered = load_registration(take.registration)
+    registered = load_registration(take.work.path / "registration")
     rows = PoseRows.match(registered, with_shape(take.body, take.poses.shape), take.poses)
     weights = []
 
@@ -136,17 +133,17 @@ def _unpose_take(folder: Path, unseen_weight: float, person: np.ndarray, take: R
 
     write_npy_rows(_vertices_path(folder, take), frames(), count=len(registered.frame_ids))
     write_npy(_weights_path(folder, take), np.stack(weights))
-    verdicts = _verdicts(take.registration, registered.frame_ids.tolist())
+    verdicts = _verdicts(take.work, registered.frame_ids.tolist())
     write_json(folder / "takes" / f"{take.name}.json", {"frames": registered.frame_ids, "verdicts": verdicts})
 
 
-def _verdicts(registration: Path, frame_ids: Sequence[int]) -> list[str]:
-    found = {record.get("frame_id"): str(record.get("verdict") or "none") for record in load_records(registration)}
+def _verdicts(work: WorkFolder, frame_ids: Sequence[int]) -> list[str]:
+    found = {record.get("frame_id"): str(record.get("verdict") or "none") for record in work.records}
     verdicts = [found.get(frame_id, "none") for frame_id in frame_ids]
     for frame_id, verdict in zip(frame_ids, verdicts, strict=True):
         if verdict not in VERDICTS:
             reason = f"frame {frame_id}: expected a verdict, found {verdict}"
-            raise InputError(reason, where=registration / "metrics.jsonl")
+            raise InputError(reason, where=work.path / "registration" / "metrics.jsonl")
     return verdicts
 
 

@@ -283,4 +283,5 @@ def _collect(stage: Stage, frame_ids: Sequence[int]) -> StageResult:
     records = [read_json(stage.frame_path(frame_id, ".json", folder="metrics")) for frame_id in frame_ids]
     write_bytes(stage.path / "metrics.jsonl", "".join(json.dumps(each) + "\n" for each in records).encode())
     frames = [stage.frame_path(frame_id) for frame_id in frame_ids]
-    return stage.finish([stage.path / "garment.npz", stage.path / "vertices.npy", *frames])
+    outputs = [stage.path / "garment.npz", stage.path / "vertices.npy", *frames]
+    return stage.finish(outputs, frames=len(frame_ids))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from capture4d.body.skinning import pose_frame
-from capture4d.captures.work_folder import load_moving_body, load_registration
+from capture4d.captures.work_folder import load_registration, open_work
 from capture4d.errors import InputError
 from capture4d.files.records import save_poses
 from capture4d.types import PoseSequence
@@ -75,7 +75,7 @@ def test_the_shape_in_the_poses_is_not_whom_they_are_worn_by(garment_model: Garm
 
 def test_the_captured_motion_gives_back_the_capture(garment_model: GarmentModel, works: list[Path]) -> None:
     registered = load_registration(works[0] / "registration")
-    _, poses = load_moving_body(works[0])
+    _, poses = open_work(works[0]).require_posed_body()
     found = garment_model.vertices(poses, remove_intersections=False)
     good = np.delete(np.arange(16), 4)
     assert np.linalg.norm(found[good] - registered.vertices[good], axis=-1).mean() < 0.004

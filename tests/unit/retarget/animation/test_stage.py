@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from capture4d.body.skinning import pose_frame, skin, with_shape
-from capture4d.captures.work_folder import load_moving_body, load_records, load_registration
+from capture4d.captures.work_folder import load_records, load_registration, open_work
 from capture4d.cli.main import main
 from capture4d.errors import InputError
 from capture4d.files.atomic import read_json, write_json
@@ -49,7 +49,7 @@ def test_the_captured_motion_on_the_captured_person_is_the_capture(model: Path, 
     apart = np.linalg.norm(found.vertices[good] - wanted.vertices[good], axis=-1)
     assert apart.mean() < 0.004
     assert np.isnan(found.residual_m).all()
-    body, motion = load_moving_body(output)
+    body, motion = open_work(output).require_posed_body()
     assert len(motion.frame_ids) == 16
     assert body.joint_names == motion.joint_names
 
@@ -65,7 +65,7 @@ def test_another_person_gets_the_garment_outside_the_body(model: Path, works, tm
     assert np.mean([record["inside_body_percent"] for record in records]) <= 0.3
     corrected = tmp_path / "corrected"
     assert run(*animate(model, poses, corrected, "--beta", "3", "1")) == 0
-    body, motion = load_moving_body(corrected)
+    body, motion = open_work(corrected).require_posed_body()
     person = with_shape(body, motion.shape)
     np.testing.assert_allclose(motion.shape, [3, 1])
     garment = load_registration(corrected / "registration").garment
@@ -120,7 +120,7 @@ def test_kernels_that_see_less_than_the_network_stand_alone(works, tmp_path: Pat
 
 
 def test_a_body_is_the_person_whose_poses_lie_beside_it(model: Path, works, tmp_path: Path) -> None:
-    body, poses = load_moving_body(works[0])
+    body, poses = open_work(works[0]).require_posed_body()
     other = np.float32([1.5] + [0.0] * (len(poses.shape) - 1))
     save_body(tmp_path / "anna" / "body.npz", body)
     save_poses(tmp_path / "anna" / "poses.npz", replace(poses, shape=other))
@@ -130,7 +130,7 @@ def test_a_body_is_the_person_whose_poses_lie_beside_it(model: Path, works, tmp_
         output = tmp_path / f"{who}{len(more)}"
         given = ("--body", tmp_path / who / "body.npz", *more, "--regressor", "linear")
         assert run(*animate(model, motion, output, *given)) == 0
-        np.testing.assert_array_equal(load_moving_body(output)[1].shape[: len(wanted)], wanted)
+        np.testing.assert_array_equal(open_work(output).require_posed_body()[1].shape[: len(wanted)], wanted)
 
 
 def test_coefficients_that_are_no_numbers_are_refused(model: Path, works, tmp_path: Path) -> None:
@@ -169,7 +169,7 @@ def test_unlike_poses_are_flagged(model: Path, works, motion, tmp_path: Path) ->
 def test_a_motion_at_another_rate_is_resampled(model: Path, motion, tmp_path: Path) -> None:
     save_poses(tmp_path / "slow.npz", replace(motion(10, 1), fps=30.0))
     assert run(*animate(model, tmp_path / "slow.npz", tmp_path / "slow")) == 0
-    motion_ = load_moving_body(tmp_path / "slow")[1]
+    motion_ = open_work(tmp_path / "slow").require_posed_body()[1]
     assert motion_.fps == 60.0
     assert len(motion_.frame_ids) == 19
 
