@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from capture4d.captures import work_folder
 from capture4d.cli.main import main
 from capture4d.files.atomic import read_json, write_json
 from capture4d.files.records import save_garment
 from capture4d.files.tensors import read_tensors
+from retarget import fit_takes
 from retarget.shapes.files import load_blendshapes
 
 
@@ -159,3 +161,21 @@ def test_a_damaged_registration_is_one_line(write_work, motion, tmp_path: Path, 
         path.write_bytes(whole[: len(whole) // 2])
         assert said in fails(capsys, "fit", work, "--output", tmp_path / "x", *quick)
         path.write_bytes(whole)
+
+
+def test_poses_and_frames_of_a_take_are_read_once(
+    works, quick, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read: list[str] = []
+
+    def counted(function):
+        def counting(path: Path):
+            read.append(f"{path.parent.name}/{path.name}")
+            return function(path)
+
+        return counting
+
+    monkeypatch.setattr(work_folder, "load_poses", counted(work_folder.load_poses))
+    monkeypatch.setattr(fit_takes, "load_registration", counted(fit_takes.load_registration))
+    assert run("fit", *works, "--output", tmp_path / "out", *quick, "--regressor", "linear") == 0
+    assert sorted(read) == sorted(["body/poses.npz"] * 3 + [f"{work.name}/registration" for work in works])
