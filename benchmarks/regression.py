@@ -22,7 +22,7 @@ from rich.console import Console
 
 from benchmarks.learning_takes import Lesson, lesson, training_set
 from benchmarks.metric import Metric
-from retarget.config import FitConfig, LstmConfig, TrainingConfig
+from retarget.config import FitConfig, LstmConfig
 from retarget.regression.controls import ControlLayout
 from retarget.regression.ensemble import ensemble
 from retarget.regression.kernel import fit_kernel
@@ -152,12 +152,9 @@ def _network(
     config: FitConfig,
     seed: int,
 ) -> Regressor:
-    settings: TrainingConfig = replace(config.training, seed=seed)
+    settings = replace(config, training=replace(config.training, seed=seed))
     with tempfile.TemporaryDirectory(prefix="capture4d-regression-") as scratch:
-        found = fit_lstm(
-            clips, layout, std, Path(scratch),
-            lstm=config.lstm, config=settings, linear=linear, linear_config=config.linear,
-        )  # fmt: skip
+        found = fit_lstm(clips, layout, std, Path(scratch), settings, linear=linear)
         runs = [Path(scratch) / name / "metrics.jsonl" for name in ("training", "final")]  # first: with validation
         lines = next(path for path in runs if path.is_file()).read_text().splitlines()
     Console(stderr=True).print(f"seed {seed}: {len(lines)} epochs, {lines[-1]}", soft_wrap=True)

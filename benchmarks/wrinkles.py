@@ -37,14 +37,14 @@ from benchmarks.learning_takes import learned_takes, registered_takes, training_
 from benchmarks.metric import Metric
 from benchmarks.renewal import renew
 from capture4d.body.skinning import with_shape
-from capture4d.captures.work_folder import load_moving_body, load_registration
+from capture4d.captures.work_folder import load_registration, open_work
 from capture4d.errors import InputError
 from capture4d.files.records import save_body, save_poses
-from retarget.animation.bodies import captured_person
+from retarget.animation.garment_model import load_garment_model
+from retarget.animation.stage import Wearer, run_on_coefficients
 from retarget.animation.stage import run as animate
 from retarget.config import AnimateConfig, FitConfig, RemovalConfig, ShapeConfig, SplitConfig
 from retarget.fit_stage import run as fit
-from retarget.garment_model import load_garment_model
 from retarget.shapes.blendshapes import project, shape_space
 from retarget.shapes.pose_normalisation import PoseRows, unpose_sequence
 from wrinkles.normal_maps.config import (
@@ -226,28 +226,29 @@ def _answers(
     model_folder = folder / "model" / "retarget"
     shape = ShapeConfig(components=max(bases.values()))
     split = SplitConfig(validation_share=validation_share)
-    fit(clips.train, model_folder, FitConfig(regressor="kernel", shape=shape, split=split), workers=workers)
+    works = [open_work(work) for work in clips.train]
+    fit(works, model_folder, FitConfig(regressor="kernel", shape=shape, split=split), workers=workers)
     known = load_garment_model(model_folder)
-    captured, config = captured_person(known.model, known.body), AnimateConfig(removal=RemovalConfig(enabled=False))
+    captured, config = known.person(), AnimateConfig(removal=RemovalConfig(enabled=False))
     placed: dict[Path, dict[str, Path]] = {}
     for work in clips.all:
         sequence = load_registration(work / "registration")
-        body, poses = load_moving_body(work)
+        body, poses = open_work(work).require_posed_body()
         rows = PoseRows.match(sequence, with_shape(body, poses.shape), poses)
         unposed = unpose_sequence(sequence, rows, captured.shape, unseen_weight=shape.unseen_weight)
         frames, weights = (np.stack(each) for each in zip(*unposed, strict=True))
         projected = project(shape_space(known.model), frames, weights).astype(np.float32)
-        own: dict[str, np.ndarray | None] = {"regression": None}
-        own |= {name: np.where(np.arange(projected.shape[1]) < count, projected, 0) for name, count in bases.items()}
+        own = {name: np.where(np.arange(projected.shape[1]) < count, projected, 0) for name, count in bases.items()}
         save_poses(folder / "poses" / f"{work.name}.npz", rows.poses)
         save_body(folder / "poses" / f"{work.name}.body.npz", body)
-        for name, coefficients in own.items():
+        motion = folder / "poses" / f"{work.name}.npz"
+        wearer = Wearer(folder / "poses" / f"{work.name}.body.npz", poses.shape.tolist())
+        for name in ("regression", *bases):
             output = folder / "answers" / name / work.name
-            animate(
-                model_folder, folder / "poses" / f"{work.name}.npz", output, config,
-                body=folder / "poses" / f"{work.name}.body.npz", beta=poses.shape.tolist(), coefficients=coefficients,
-                workers=workers,
-            )  # fmt: skip
+            if name == "regression":
+                animate(model_folder, motion, output, config, wearer=wearer, workers=workers)
+            else:
+                run_on_coefficients(model_folder, motion, own[name], output, config, wearer=wearer, workers=workers)
             make_pairs(output, clips.pairs, high_from=work)
             placed.setdefault(work, {})[name] = output
 

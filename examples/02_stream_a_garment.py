@@ -15,8 +15,7 @@ from pathlib import Path
 from capture4d.body.skinning import skin, with_pose
 from capture4d.files.meshes import write_mesh
 from capture4d.files.records import load_poses
-from retarget.animation.bodies import captured_person
-from retarget.garment_model import load_garment_model
+from retarget.animation.garment_model import load_garment_model
 from retarget.regression.controls import ControlStream
 from retarget.shapes.blendshapes import reconstruct
 
@@ -29,7 +28,7 @@ def main() -> None:
     options = parser.parse_args()
 
     known = load_garment_model(options.model)
-    model, person = known.model, captured_person(known.model, known.body)
+    model, person = known.model, known.person()
     regressor = known.best
     controls, answers = ControlStream(regressor.layout), regressor.stream()
     poses = load_poses(options.poses)

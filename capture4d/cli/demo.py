@@ -41,8 +41,10 @@ def run_demo(output: Path, *, workers: int, overwrite: bool = False) -> tuple[Pa
     from capture4d import pipeline
     from capture4d.app.compare.config import CompareConfig
     from capture4d.app.compare.page import run as compare
+    from capture4d.captures.work_folder import open_work
     from data_synth.config import PRESETS
     from data_synth.stage import run as synthesise
+    from retarget.animation.stage import Wearer
     from retarget.animation.stage import run as animate
     from retarget.config import AnimateConfig, FitConfig, TrainingConfig
     from retarget.fit_stage import run as fit
@@ -53,7 +55,7 @@ def run_demo(output: Path, *, workers: int, overwrite: bool = False) -> tuple[Pa
     _calibrate_demo(output / "capture" / "rig.json", output / "rig", workers=workers, overwrite=overwrite)
     pipeline.run(output / "capture", output, tracked=True, draw=False, workers=workers, overwrite=overwrite)
     quick = TrainingConfig(epochs=60, patience=20)
-    fit([output], output / "retarget", FitConfig(training=quick), workers=workers, overwrite=overwrite)
+    fit([open_work(output)], output / "retarget", FitConfig(training=quick), workers=workers, overwrite=overwrite)
     network = WRINKLES["small"]
     network = replace(network, held_out=HELD_OUT, schedule=replace(network.schedule, steps=WRINKLE_STEPS))
     train_wrinkles([output], output / "wrinkles" / "model", network, workers=workers, overwrite=overwrite)
@@ -65,7 +67,7 @@ def run_demo(output: Path, *, workers: int, overwrite: bool = False) -> tuple[Pa
         output / "body" / "poses.npz",
         output / "other",
         AnimateConfig(),
-        beta=OTHER_PERSON,
+        wearer=Wearer(beta=OTHER_PERSON),
         workers=workers,
         overwrite=overwrite,
     )

@@ -30,6 +30,7 @@ class Fit(StageOptions):
     config: Annotated[FitConfig, arg(name="")] = field(default_factory=FitConfig)
 
     def __call__(self) -> int:
+        from capture4d.captures.work_folder import open_work
         from retarget.fit_stage import run
 
         if not self.works:
@@ -38,7 +39,7 @@ class Fit(StageOptions):
         if self.output is None and others:
             raise InputError(f"--output: expected a work folder for what {1 + len(others)} takes give, found none")
         folder = (self.output or first) / "retarget"
-        works = [first, *others]
+        works = [open_work(work) for work in (first, *others)]
         run(works, folder, self.config, device=self.device, workers=self.workers, overwrite=self.overwrite)
         print(f"model: {folder}")
         return GOOD
@@ -63,15 +64,14 @@ class Animate(GradedOptions):
     config: Annotated[AnimateConfig, arg(name="")] = field(default_factory=AnimateConfig)
 
     def __call__(self) -> int:
-        from retarget.animation.stage import run
+        from retarget.animation.stage import Wearer, run
 
         result = run(
             self.model,
             self.poses,
             self.output,
             self.config,
-            body=self.body,
-            beta=self.beta,
+            wearer=Wearer(self.body, self.beta),
             device=self.device,
             workers=self.workers,
             overwrite=self.overwrite,

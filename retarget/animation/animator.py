@@ -18,7 +18,10 @@ from capture4d.types import BlendshapeModel, PoseSequence
 from retarget.config import AnimateConfig
 from retarget.shapes.blendshapes import reconstruct, skin_frames
 
-__all__ = ["AnimatedFrame", "Animator"]
+__all__ = ["FRAMES_AT_ONCE", "AnimatedFrame", "Animator"]
+
+FRAMES_AT_ONCE = 16
+"""More take more memory; another number, too, changes the last bits of matrix products."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

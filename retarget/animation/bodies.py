@@ -7,17 +7,18 @@ Corrected: M_bar + o'_i - o'_captured, restricted to the garment.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal, assert_never
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 
 from capture4d.body.binding import embedded_offset
 from capture4d.body.skinning import ShapedBody, with_shape
 from capture4d.errors import InputError
-from capture4d.types import BlendshapeModel, Body
+from capture4d.types import BlendshapeModel, Body, PoseSequence
 
-__all__ = ["captured_person", "require_skeleton", "retargeted_mean"]
+__all__ = ["captured_person", "person_of_shape", "require_motion", "retargeted_mean"]
 
 
 def captured_person(model: BlendshapeModel, body: Body) -> ShapedBody:
@@ -26,13 +27,48 @@ def captured_person(model: BlendshapeModel, body: Body) -> ShapedBody:
     Raises:
         InputError: the model does not say who that was, or the body has another skeleton.
     """
-    require_skeleton(model, body)
+    _require_skeleton(model, body)
     if model.garment.body_shape is None:
         raise InputError("model: expected the shape of the captured person in its garment, found none")
     return with_shape(body, model.garment.body_shape)
 
 
-def require_skeleton(model: BlendshapeModel, body: Body) -> None:
+def person_of_shape(
+    model: BlendshapeModel, body: Body, beta: Sequence[float] | Float[np.ndarray, " betas"]
+) -> ShapedBody:
+    """Somebody to put the garment on.
+
+    Args:
+        beta: shape coefficients; those that are left out at the end are 0.
+    Raises:
+        InputError: the body has other joints than the model, or the coefficients are too many or not finite.
+    """
+    _require_skeleton(model, body)
+    shape, given = np.zeros(len(body.shape_directions), np.float32), np.asarray(beta, np.float32)
+    if not np.isfinite(given).all():
+        raise InputError("beta: expected finite numbers, found NaN or inf")
+    if len(given) > len(shape):
+        raise InputError(f"beta: expected at most {len(shape)} coefficients, found {len(given)}")
+    shape[: len(given)] = given
+    return with_shape(body, shape)
+
+
+def require_motion(model: BlendshapeModel, poses: PoseSequence) -> None:
+    """
+    Raises:
+        InputError: there are no poses, not in the order of their frames, or of other joints than the model.
+    """
+    if not len(poses.frame_ids) or (np.diff(poses.frame_ids) <= 0).any():
+        disorder = " in disorder" if len(poses.frame_ids) else ""
+        raise InputError(f"expected frames with ascending numbers, found {len(poses.frame_ids)} frames{disorder}")
+    if poses.joint_names != model.joint_names:
+        raise InputError(
+            f"expected the {len(model.joint_names)} joints of the model, found {len(poses.joint_names)} "
+            f"({', '.join(poses.joint_names[:4])}, ...)"
+        )
+
+
+def _require_skeleton(model: BlendshapeModel, body: Body) -> None:
     """
     Raises:
         InputError: the body has other joints than the model.

@@ -11,7 +11,6 @@ References: DeepWrinkles (ECCV 2018), section 3.3: 4 layers of 256, 3 frames in 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from jaxtyping import Float, Float32
 from torch import Tensor, nn
 
 from capture4d.errors import InputError
+from capture4d.files.checkpoints import load_weights
 from capture4d.settings import SettingError
 from retarget.config import LstmConfig
 from retarget.regression.controls import ControlLayout
@@ -175,16 +175,8 @@ def load_lstm(
     placed = usable_device(device)
     shapes = len(scales.std)
     network = EncoderDecoder(layout.size + layout.config.history * shapes, shapes, config)
-    _load_weights(network, file.prefixed("network."), path)
+    weights = {name: torch.from_numpy(each) for name, each in file.prefixed("network.").items()}
+    load_weights(network, weights, source=path)
     if config.over_linear and linear is None:
         raise InputError(f"{path}: expected the linear regression it was trained over beside it, found none")
     return LstmRegressor(layout, scales, config, network.to(placed).eval(), linear if config.over_linear else None)
-
-
-def _load_weights(network: nn.Module, weights: Mapping[str, np.ndarray], path: Path) -> None:
-    wanted = {name: tuple(each.shape) for name, each in network.state_dict().items()}
-    found = {name: tuple(each.shape) for name, each in weights.items()}
-    if wanted != found:
-        odd = sorted(name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name))[0]
-        raise InputError(f"{path}: expected weights {odd} of {wanted.get(odd)}, found {found.get(odd)}")
-    network.load_state_dict({name: torch.from_numpy(each) for name, each in weights.items()})

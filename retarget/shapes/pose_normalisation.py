@@ -12,12 +12,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64
+from jaxtyping import Bool, Float, Float32, Float64, Int32
 
 from capture4d.body.binding import embedded_offset
 from capture4d.body.skinning import ShapedBody, pose_frame, unskin, with_shape
 from capture4d.errors import InputError
-from capture4d.types import PoseSequence, RegisteredSequence
+from capture4d.types import Garment, PoseSequence, RegisteredSequence
 
 __all__ = ["PoseRows", "unpose_frame", "unpose_sequence"]
 
@@ -35,7 +35,14 @@ class PoseRows:
         Raises:
             InputError: the garment is not bound to this skeleton, or a frame has no pose.
         """
-        weights = registered.garment.skin_weights
+        return PoseRows.of_frames(registered.frame_ids, registered.garment, shaped, poses)
+
+    @staticmethod
+    def of_frames(
+        frame_ids: Int32[np.ndarray, " frames"], garment: Garment, shaped: ShapedBody, poses: PoseSequence
+    ) -> PoseRows:
+        """`match` for somebody who has no frames at hand."""
+        weights = garment.skin_weights
         if weights is None:
             raise InputError("registration: expected a template with skin weights, found none; bind it to a body")
         joints = len(shaped.body.joint_names)
@@ -45,15 +52,15 @@ class PoseRows:
                 f"{weights.shape[1]} in the template's skin weights"
             )
         at = {int(frame_id): row for row, frame_id in enumerate(poses.frame_ids)}
-        missing = [int(frame_id) for frame_id in registered.frame_ids if int(frame_id) not in at]
+        missing = [int(frame_id) for frame_id in frame_ids if int(frame_id) not in at]
         if missing:
             raise InputError(f"poses: expected one for every registered frame, found none for frame {missing[0]}")
-        rows = [at[int(frame_id)] for frame_id in registered.frame_ids]
+        rows = [at[int(frame_id)] for frame_id in frame_ids]
         kept = PoseSequence(
             poses.rotations[rows],
             poses.translations[rows],
             poses.shape,
-            registered.frame_ids,
+            frame_ids,
             poses.fps,
             poses.joint_names,
         )

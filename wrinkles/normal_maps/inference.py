@@ -13,10 +13,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from capture4d.errors import InputError
+from capture4d.files.checkpoints import load_weights
 from capture4d.files.tensors import read_tensors, write_tensors
 from wrinkles.normal_maps.config import MapConfig, NetworkConfig
 from wrinkles.normal_maps.networks import UNet, set_test_statistics
-from wrinkles.normal_maps.training import load_weights
 
 __all__ = ["WrinkleModel", "load_model", "save_model"]
 
@@ -127,7 +127,7 @@ def load_model(path: str | Path) -> WrinkleModel:
     generator.to_empty(device="cpu")
     reference = file[REFERENCE]
     weights = {name: torch.from_numpy(each) for name, each in file.tensors.items() if name != REFERENCE}
-    load_weights(generator, weights, source=str(path))
+    load_weights(generator, weights, source=path)
     return WrinkleModel(
         generator.to(memory_format=torch.channels_last),  # pyright: ignore[reportCallIssue]
         config, texels=file.entry("texels"), maps=maps, layout_digest=file.entry("layout_digest"), reference=reference,

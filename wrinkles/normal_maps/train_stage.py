@@ -17,9 +17,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
-import safetensors.torch
 import torch
-from safetensors import SafetensorError
 
 from capture4d.captures.work_folder import registered_digest
 from capture4d.errors import InputError
@@ -36,7 +34,7 @@ from wrinkles.normal_maps.pair_stage import ensure_pairs
 from wrinkles.normal_maps.pair_stage import run as make_pairs
 from wrinkles.normal_maps.pairs import PairTake, batches, consecutive_pairs, fitted, split
 from wrinkles.normal_maps.spaces import to_colours
-from wrinkles.normal_maps.training import TrainingState, load_tensors, new_state, state_tensors, train_step
+from wrinkles.normal_maps.training import TrainingState, load_state, new_state, save_state, train_step
 
 __all__ = ["learned_takes", "run", "score_take"]
 
@@ -44,8 +42,6 @@ SCHEMA = 1
 TAKES = "takes.json"
 KEPT_CHECKPOINTS = 2
 SAMPLES = 4
-LOGGED = "logged."
-"""Begins the names, in a checkpoint, of losses that no line of the log holds yet."""
 
 
 def run(
@@ -95,20 +91,23 @@ def run(
     stage = open_stage(
         output, name="train-wrinkles", schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite
     )
+    weights, measures = stage.path / "generator.safetensors", stage.path / "held_out.json"
+    if stage.was_complete and weights.is_file() and measures.is_file():
+        return stage.finish([weights], changed=False)
     write_json(stage.path / TAKES, {work.name: registered_digest(work) for work in works})
     recent = _resume(stage, state)
     _train(stage, state, recent, [train for train, _ in parts], [held for _, held in parts], config)
     model = WrinkleModel(
         state.generator, config.network, texels=config.texels, maps=maps, layout_digest=digest, reference=mesh.vertices
     )
-    save_model(stage.path / "generator.safetensors", model)
+    save_model(weights, model)
     measured = {}
     for _, held in parts:
         if len(held.frame_ids):
             made, low = score_take(model, held, mesh)
             measured[held.name] = {"made": _json(made), "low": _json(low)}
-    write_json(stage.path / "held_out.json", measured)
-    return stage.finish([stage.path / "generator.safetensors"])
+    write_json(measures, measured)
+    return stage.finish([weights])
 
 
 def learned_takes(model: Path) -> set[str]:
@@ -178,11 +177,7 @@ def _checkpoints(stage: Stage) -> list[Path]:
 
 
 def _save(stage: Stage, state: TrainingState, recent: Sequence[Mapping[str, float]]) -> None:
-    names = sorted(recent[0]) if recent else ()
-    logged = {
-        f"{LOGGED}{name}": torch.tensor([losses[name] for losses in recent], dtype=torch.float64) for name in names
-    }
-    write_bytes(_checkpoint(stage, state.step), safetensors.torch.save(state_tensors(state) | logged))
+    save_state(_checkpoint(stage, state.step), state, recent)
     for old in _checkpoints(stage)[:-KEPT_CHECKPOINTS]:
         old.unlink()
 
@@ -190,16 +185,7 @@ def _save(stage: Stage, state: TrainingState, recent: Sequence[Mapping[str, floa
 def _resume(stage: Stage, state: TrainingState) -> list[dict[str, float]]:
     """Go on from the newest checkpoint, if there is one; the losses that it had not logged yet."""
     paths = _checkpoints(stage)
-    if not paths:
-        return []
-    try:
-        tensors = safetensors.torch.load(paths[-1].read_bytes())
-    except SafetensorError as error:
-        raise InputError(f"{paths[-1]}: not a readable checkpoint, cut off or damaged ({error})") from None
-    logged = {name: tensors.pop(name).tolist() for name in list(tensors) if name.startswith(LOGGED)}
-    load_tensors(state, tensors, source=str(paths[-1]))
-    names = [name.removeprefix(LOGGED) for name in logged]
-    return [dict(zip(names, losses, strict=True)) for losses in zip(*logged.values(), strict=True)]
+    return load_state(paths[-1], state) if paths else []
 
 
 def _logged(path: Path, step: int) -> list[dict[str, float]]:

@@ -1,4 +1,4 @@
-"""One training step of the wrinkle GAN, and its state as named tensors, so that a resumed run is the same run.
+"""One training step of the wrinkle GAN, and its state in a checkpoint, so that a resumed run is the same run.
 
 Step t (DeepWrinkles, Eq. 3): y = G(low_t). D learns to tell (low_t, high_t) from (low_t, y); G learns from
 1 * GAN + 100 * L1(y, high_t) + 50 * temporal(y, high_t-1). Texels without information are zero for D, and absent from
@@ -7,20 +7,24 @@ the other losses.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from capture4d.errors import InputError
+from capture4d.files.checkpoints import read_checkpoint, write_checkpoint
 from wrinkles.normal_maps.config import LossConfig, ScheduleConfig, WrinkleConfig
 from wrinkles.normal_maps.losses import data_loss, gan_loss, temporal_loss
 from wrinkles.normal_maps.networks import PatchDiscriminator, UNet
 from wrinkles.normal_maps.pairs import Batch, augmented
 
-__all__ = ["TrainingState", "learning_rate", "load_tensors", "load_weights", "new_state", "state_tensors", "train_step"]
+__all__ = ["TrainingState", "learning_rate", "load_state", "new_state", "save_state", "train_step"]
+
+_KIND = "capture4d wrinkle training"
 
 
 @dataclass(slots=True, eq=False)
@@ -107,64 +111,42 @@ def learning_rate(step: int, config: ScheduleConfig) -> float:
     return config.learning_rate * max(share, 0.0)
 
 
-# --- state as named tensors --------------------------------------------------------------------------------------
+# --- checkpoints -------------------------------------------------------------------------------------------------
 
 
-def state_tensors(state: TrainingState) -> dict[str, Tensor]:
-    """Networks, optimisers, torch's random state and the step, as safetensors takes them."""
-    tensors = {"step": torch.tensor(state.step), "random": torch.get_rng_state()}
-    for name, network, optimizer in _parts(state):
-        tensors |= {f"{name}.{key}": value for key, value in network.state_dict().items()}
-        for index, moments in optimizer.state_dict()["state"].items():
-            tensors |= {f"{name}_optimizer.{index}.{key}": value for key, value in moments.items()}
-    return {name: tensor.contiguous().clone() for name, tensor in tensors.items()}
+def save_state(path: Path, state: TrainingState, losses: Sequence[Mapping[str, float]]) -> None:
+    """Write everything a resume needs.
+
+    Args:
+        losses: of the last steps, which no line of the log holds yet.
+    """
+    names = sorted(losses[0]) if losses else ()
+    unlogged = {name: torch.tensor([each[name] for each in losses], dtype=torch.float64) for name in names}
+    write_checkpoint(
+        path, _KIND, modules=_networks(state), optimisers=_optimizers(state), tensors=unlogged,
+        note={"step": state.step},
+    )  # fmt: skip
 
 
-def load_tensors(state: TrainingState, tensors: Mapping[str, Tensor], *, source: str) -> None:
-    """Go on from a checkpoint.
+def load_state(path: Path, state: TrainingState) -> list[dict[str, float]]:
+    """Go on from a checkpoint; the losses that it had not logged yet.
 
     Raises:
-        InputError: `source` holds another architecture, or is not whole.
+        InputError: it is damaged, or of another architecture.
     """
-    for needed in ("step", "random"):
-        if needed not in tensors:
-            raise InputError(f"{source}: expected a whole checkpoint, found one without '{needed}'")
-    for name, network, optimizer in _parts(state):
-        weights = {key.removeprefix(f"{name}."): value for key, value in tensors.items() if key.startswith(f"{name}.")}
-        load_weights(network, weights, source=source)
-        moments: dict[int, dict[str, Tensor]] = {}
-        for key, value in tensors.items():
-            if key.startswith(f"{name}_optimizer."):
-                _, index, entry = key.split(".")
-                moments.setdefault(int(index), {})[entry] = value
-        for index, parameter in enumerate(optimizer.param_groups[0]["params"]):
-            for entry, value in moments.get(index, {}).items():
-                if entry != "step" and value.shape != parameter.shape:
-                    raise InputError(f"{source}: '{name}_optimizer.{index}.{entry}': expected "
-                                     f"{tuple(parameter.shape)}, found {tuple(value.shape)}")  # fmt: skip
-        optimizer.load_state_dict({"state": moments, "param_groups": optimizer.state_dict()["param_groups"]})
-    state.step = int(tensors["step"])
-    torch.set_rng_state(tensors["random"])
-
-
-def load_weights(network: nn.Module, weights: Mapping[str, Tensor], *, source: str) -> None:
-    """Fill a network.
-
-    Raises:
-        InputError: `source` holds the weights of another architecture.
-    """
-    own = network.state_dict()
-    missing, strange = own.keys() - weights.keys(), weights.keys() - own.keys()
-    other = [key for key in own.keys() & weights.keys() if own[key].shape != weights[key].shape]
-    if missing or strange or other:
-        key = min(other or missing or strange)
-        expected, found = (tuple(each[key].shape) if key in each else "none" for each in (own, weights))
-        raise InputError(f"{source}: weights of another architecture: '{key}', expected {expected}, found {found}")
-    network.load_state_dict(weights)
-
-
-def _parts(state: TrainingState) -> tuple[tuple[str, nn.Module, torch.optim.Adam], ...]:
-    return (
-        ("generator", state.generator, state.generator_optimizer),
-        ("discriminator", state.discriminator, state.discriminator_optimizer),
+    unlogged, note = read_checkpoint(
+        path, _KIND, modules=_networks(state), optimisers=_optimizers(state), command="capture4d wrinkles train"
     )
+    state.step = note["step"]
+    return [
+        dict(zip(unlogged, losses, strict=True))
+        for losses in zip(*(each.tolist() for each in unlogged.values()), strict=True)
+    ]
+
+
+def _networks(state: TrainingState) -> dict[str, nn.Module]:
+    return {"generator": state.generator, "discriminator": state.discriminator}
+
+
+def _optimizers(state: TrainingState) -> dict[str, torch.optim.Optimizer]:
+    return {"generator": state.generator_optimizer, "discriminator": state.discriminator_optimizer}

@@ -14,8 +14,9 @@ from capture4d.types import Body, Mesh, PoseSequence, RegisteredSequence
 from data_synth.config import OTHER_BODIES
 from retarget.animation.animator import Animator
 from retarget.animation.bodies import captured_person, retargeted_mean
+from retarget.animation.garment_model import GarmentModel
 from retarget.config import AnimateConfig, ShapeConfig
-from retarget.garment_model import GarmentModel, regressor_files
+from retarget.model_folder import regressor_files
 from retarget.regression.controls import control_vectors
 from retarget.shapes.blendshapes import project, reconstruct, shape_space, skin_frames
 from retarget.shapes.pose_normalisation import PoseRows, unpose_sequence

@@ -53,7 +53,8 @@ from capture4d.files.atomic import file_digest, read_json, write_bytes, write_js
 from capture4d.geometry.uv_layout import millimetres_per_texel
 from capture4d.runs.stage import open_stage, require_complete
 from capture4d.types import RegisteredSequence
-from retarget.garment_model import GarmentModel, learned_frames, load_garment_model, regressor_files
+from retarget.animation.garment_model import GarmentModel, load_garment_model
+from retarget.model_folder import learned_frames, regressor_files
 from wrinkles.normal_maps.apply_stage import generated_normals
 from wrinkles.normal_maps.config import PairConfig
 from wrinkles.normal_maps.display import fill_holes

@@ -1,6 +1,7 @@
 """A tube of cloth around a bending bone, whose unposed shape is a known mix of a few waves."""
 
 import json
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from capture4d.body.skinning import pose_frame, skin, with_shape
 from capture4d.captures.work_folder import REGISTER, VERDICTS, stack_vertices
+from capture4d.cli.main import main
 from capture4d.files.atomic import write_bytes, write_npz
 from capture4d.files.records import save_body, save_garment, save_poses
 from capture4d.geometry.closest_points import closest_points
@@ -144,3 +146,34 @@ def write_work(make_world):
         return work
 
     return write
+
+
+@pytest.fixture(scope="session")
+def quick() -> tuple[str, ...]:
+    """Options with which `fit` takes seconds."""
+    shape = ("--shape.max-error-mm", "0.1")
+    return *shape, "--lstm.layers", "1", "--lstm.size", "16", "--training.epochs", "3", "--workers", "1"
+
+
+@pytest.fixture(scope="session")
+def works(write_work, make_world, tmp_path_factory) -> list[Path]:
+    """Three takes, one frame of each flagged."""
+    world, folder = make_world(waves=3), tmp_path_factory.mktemp("works")
+    return [write_work(folder / f"take{seed}", some_motion(16, seed), world=world, flagged=(4,)) for seed in range(3)]
+
+
+@pytest.fixture(scope="session")
+def learned(works, quick, tmp_path_factory) -> Path:
+    output = tmp_path_factory.mktemp("fit") / "learned"
+    options = ["--output", str(output), "--split.validation", "take2", "--licence", "CC0", *quick]
+    with pytest.raises(SystemExit) as exit_:
+        main(["fit", *map(str, works), *options])
+    assert not exit_.value.code
+    return output
+
+
+@pytest.fixture
+def model(learned: Path, tmp_path: Path) -> Path:
+    """A copy of a learned garment, to be spoilt."""
+    shutil.copytree(learned, tmp_path / "learned")
+    return tmp_path / "learned" / "retarget"

@@ -1,6 +1,5 @@
-"""Fit and animate from the command line: what comes out, resuming, and what is wrong in one line."""
+"""Fit from the command line: what comes out, resuming, and what is wrong in one line."""
 
-import pickle
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -8,54 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture4d.body.skinning import pose_frame, skin, with_shape
-from capture4d.captures.work_folder import load_moving_body, load_records, load_registration
-from capture4d.errors import InputError
+from capture4d.captures import work_folder
 from capture4d.files.atomic import read_json, write_json
-from capture4d.files.records import load_body, save_body, save_garment, save_poses
-from capture4d.files.tensors import read_tensors, write_tensors
-from retarget.animation.stage import run as animate_poses
-from retarget.config import AnimateConfig, SplitConfig
-from retarget.regression.splits import split_takes
+from capture4d.files.records import save_garment
+from capture4d.files.tensors import read_tensors
+from retarget import fit_takes
 from retarget.shapes.files import load_blendshapes
 from tests.command_line import fails, run
-
-QUICK = (
-    "--shape.max-error-mm",
-    "0.1",
-    "--lstm.layers",
-    "1",
-    "--lstm.size",
-    "16",
-    "--training.epochs",
-    "3",
-    "--workers",
-    "1",
-)
-
-
-@pytest.fixture(scope="module")
-def works(write_work, motion, make_world, tmp_path_factory) -> list[Path]:
-    world, folder = make_world(waves=3), tmp_path_factory.mktemp("works")
-    return [write_work(folder / f"take{seed}", motion(16, seed), world=world, flagged=(4,)) for seed in range(3)]
-
-
-@pytest.fixture(scope="module")
-def learned(works, tmp_path_factory) -> Path:
-    output = tmp_path_factory.mktemp("fit") / "learned"
-    assert run("fit", *works, "--output", output, "--split.validation", "take2", "--licence", "CC0", *QUICK) == 0
-    return output
-
-
-@pytest.fixture
-def model(learned: Path, tmp_path: Path) -> Path:
-    """A copy, to be spoilt."""
-    shutil.copytree(learned, tmp_path / "learned")
-    return tmp_path / "learned" / "retarget"
-
-
-def animate(model: Path, poses: Path, output: Path, *more: str | Path) -> tuple[str | Path, ...]:
-    return "animate", model, "--poses", poses, "--output", output, "--workers", "1", *more
 
 
 def test_fit_finds_the_waves_and_says_so(model: Path, works, make_world) -> None:
@@ -81,213 +39,56 @@ def test_fit_finds_the_waves_and_says_so(model: Path, works, make_world) -> None
 
 
 def test_validation_takes_are_learned_from_in_the_end_but_not_the_end_of_the_only_take(
-    model: Path, write_work, motion, make_world, tmp_path: Path
+    model: Path, write_work, motion, make_world, tmp_path: Path, quick
 ) -> None:
     def learned_frames(folder: Path) -> int:
         return len(read_tensors(folder / "kernel.safetensors", "capture4d kernel regressor")["frames"])
 
     assert learned_frames(model) == 3 * 15  # one frame of each take is flagged
     work = write_work(tmp_path / "only", motion(60, 0), world=make_world(waves=3))
-    assert run("fit", work, "--output", tmp_path / "alone", *QUICK) == 0
+    assert run("fit", work, "--output", tmp_path / "alone", *quick) == 0
     split = read_json(tmp_path / "alone" / "retarget" / "fit.json")["split"]
     assert split == {"training": ["only[0:21]"], "validation": ["only[51:60]"], "held out": []}
     assert learned_frames(tmp_path / "alone" / "retarget") == 21
 
 
-def test_fit_again_changes_nothing_and_other_settings_are_refused(model: Path, works, capsys) -> None:
+def test_fit_again_changes_nothing_and_other_settings_are_refused(model: Path, works, quick, capsys) -> None:
     again = ("fit", *works, "--output", model.parent, "--split.validation", "take2", "--licence", "CC0")
     before = {path.name: path.read_bytes() for path in model.glob("*.safetensors")}
     digest = read_json(model / "stage.json")["digest"]
-    assert run(*again, *QUICK) == 0
+    assert run(*again, *quick) == 0
     assert {path.name: path.read_bytes() for path in model.glob("*.safetensors")} == before
     assert read_json(model / "stage.json")["digest"] == digest
-    assert "other settings" in fails(capsys, *again, *QUICK, "--shape.components", "2")
+    assert "other settings" in fails(capsys, *again, *quick, "--shape.components", "2")
 
 
-def test_the_captured_motion_on_the_captured_person_is_the_capture(model: Path, works, tmp_path: Path) -> None:
-    output = tmp_path / "again"
-    poses = works[0] / "body" / "poses.npz"
-    assert run(*animate(model, poses, output, "--regressor", "linear", "--removal.no-enabled")) == 0
-    found, wanted = (load_registration(each / "registration") for each in (output, works[0]))
-    good = np.delete(np.arange(16), 4)
-    apart = np.linalg.norm(found.vertices[good] - wanted.vertices[good], axis=-1)
-    assert apart.mean() < 0.004
-    assert np.isnan(found.residual_m).all()
-    body, motion = load_moving_body(output)
-    assert len(motion.frame_ids) == 16
-    assert body.joint_names == motion.joint_names
-
-
-def test_another_person_gets_the_garment_outside_the_body(model: Path, works, tmp_path: Path, capsys) -> None:
-    output = tmp_path / "thick"
-    poses = works[2] / "body" / "poses.npz"
-    assert run(*animate(model, poses, output, "--beta", "3", "1", "--mean", "captured")) == 0
-    records = load_records(output / "registration")
-    assert (
-        np.mean([record["inside_before_percent"] for record in records]) > 10
-    )  # a thick limb in a tube that did not grow
-    assert np.mean([record["inside_body_percent"] for record in records]) <= 0.3
-    corrected = tmp_path / "corrected"
-    assert run(*animate(model, poses, corrected, "--beta", "3", "1")) == 0
-    body, motion = load_moving_body(corrected)
-    person = with_shape(body, motion.shape)
-    np.testing.assert_allclose(motion.shape, [3, 1])
-    garment = load_registration(corrected / "registration").garment
-    posed = skin(garment.template.vertices, garment.skin_weights, pose_frame(person, motion, 0).transforms)
-    assert np.linalg.norm(load_registration(corrected / "registration").vertices[0] - posed, axis=1).mean() < 0.02
-    # and the report works on it, with limits
-    capsys.readouterr()
-    assert run("report", output, "--workers", "1", "--fail-above", "inside_body_percent=0.3") == 0
-    page = (output / "report" / "index.html").read_text()
-    assert "is inside the body" in page
-    assert page.count("data:image/webp") >= 8
-    assert run("report", output, "--workers", "1", "--fail-above", "inside_before_percent=0.3") == 1
-
-
-def test_an_interrupted_animation_is_finished_by_the_same_command(model: Path, works, tmp_path: Path) -> None:
-    poses, output = works[1] / "body" / "poses.npz", tmp_path / "out"
-    assert run(*animate(model, poses, output)) == 0
-    digest = read_json(output / "registration" / "stage.json")["digest"]
-    for path in sorted((output / "registration" / "frames").glob("*.npz"))[5:9]:
-        path.unlink()
-    (output / "registration" / "coefficients.npy").unlink()
-    assert run(*animate(model, poses, output)) == 0
-    assert read_json(output / "registration" / "stage.json")["digest"] == digest
-
-
-def test_animate_takes_the_ensemble_unless_told_otherwise(model: Path, works, tmp_path: Path, capsys) -> None:
-    poses = works[0] / "body" / "poses.npz"
-    said = {}
-    for name in ("auto", "ensemble", "kernel", "lstm", "linear"):
-        assert run(*animate(model, poses, tmp_path / name, "--regressor", name)) == 0
-        said[name] = np.load(tmp_path / name / "registration" / "coefficients.npy")
-    np.testing.assert_array_equal(said["auto"], said["ensemble"])
-    np.testing.assert_allclose(said["ensemble"], 0.75 * said["kernel"] + 0.25 * said["lstm"], atol=1e-6)
-    assert np.abs(said["lstm"] - said["kernel"]).max() > 1e-3
-    assert np.abs(said["lstm"] - said["linear"]).max() > 1e-3
-    (model / "lstm.safetensors").unlink()
-    assert run(*animate(model, poses, tmp_path / "no lstm")) == 0
-    np.testing.assert_array_equal(np.load(tmp_path / "no lstm" / "registration" / "coefficients.npy"), said["kernel"])
-    assert "expected a regressor 'ensemble'" in fails(
-        capsys, *animate(model, poses, tmp_path / "x", "--regressor", "ensemble")
-    )
-
-
-def test_kernels_that_see_less_than_the_network_stand_alone(works, tmp_path: Path, capsys) -> None:
-    output = tmp_path / "up"
-    assert run("fit", *works, "--output", output, *QUICK, "--control.up") == 0
-    assert "ensemble" not in read_json(output / "retarget" / "fit.json")
-    poses = works[0] / "body" / "poses.npz"
-    assert "its kernels do not see all that its LSTM sees" in fails(
-        capsys, *animate(output, poses, tmp_path / "x", "--regressor", "ensemble")
-    )
-
-
-def test_a_body_is_the_person_whose_poses_lie_beside_it(model: Path, works, tmp_path: Path) -> None:
-    body, poses = load_moving_body(works[0])
-    other = np.float32([1.5] + [0.0] * (len(poses.shape) - 1))
-    save_body(tmp_path / "anna" / "body.npz", body)
-    save_poses(tmp_path / "anna" / "poses.npz", replace(poses, shape=other))
-    save_body(tmp_path / "alone" / "body.npz", body)
-    motion = works[0] / "body" / "poses.npz"
-    for who, more, wanted in (("anna", (), other), ("alone", (), 0 * other), ("anna", ("--beta", "-1"), [-1])):
-        output = tmp_path / f"{who}{len(more)}"
-        given = ("--body", tmp_path / who / "body.npz", *more, "--regressor", "linear")
-        assert run(*animate(model, motion, output, *given)) == 0
-        np.testing.assert_array_equal(load_moving_body(output)[1].shape[: len(wanted)], wanted)
-
-
-def test_coefficients_that_are_no_numbers_are_refused(model: Path, works, tmp_path: Path) -> None:
-    poses = works[0] / "body" / "poses.npz"
-    count = len(load_blendshapes(model / "blendshapes.safetensors").std)
-    for coefficients, said in (
-        (np.full((16, count), np.nan, np.float32), "expected finite numbers, found NaN"),
-        (np.zeros((15, count), np.float32), r"expected an array of \(16, 3\), found \(15, 3\)"),
-    ):
-        with pytest.raises(InputError, match=said):
-            animate_poses(model, poses, tmp_path / "x", AnimateConfig(), coefficients=coefficients)
-    assert not (tmp_path / "x").exists()
-
-
-def test_poses_that_validated_and_were_learned_from_then_are_no_strangers(model: Path, works, tmp_path: Path) -> None:
-    """They all lie at no distance; how far they lay when they validated is known beside."""
-    poses = works[2] / "body" / "poses.npz"
-    assert run(*animate(model, poses, tmp_path / "again", "--unlike-deg", "0")) == 0
-    distances = [record["pose_distance_deg"] for record in load_records(tmp_path / "again" / "registration")]
-    assert max(np.delete(distances, 4)) < 0.1  # one frame was flagged
-    assert read_json(model / "fit.json")["validated_deg"] > 1
-
-
-def test_unlike_poses_are_flagged(model: Path, works, motion, tmp_path: Path) -> None:
-    poses = motion(6, 9)
-    twisted = poses.rotations.copy()
-    twisted[3:, 1] = twisted[3:, 1] @ np.diag([-1, 1, -1]).astype(np.float32)  # half a turn
-    save_poses(tmp_path / "odd.npz", replace(poses, rotations=twisted))
-    assert run(*animate(model, tmp_path / "odd.npz", tmp_path / "odd", "--unlike-deg", "40")) == 0
-    records = load_records(tmp_path / "odd" / "registration")
-    assert [record["verdict"] for record in records[3:]] == ["check"] * 3
-    assert "deg from every pose that was learned" in records[3]["reasons"][0]
-    assert records[0]["pose_distance_deg"] < 40
-
-
-def test_a_motion_at_another_rate_is_resampled(model: Path, motion, tmp_path: Path) -> None:
-    save_poses(tmp_path / "slow.npz", replace(motion(10, 1), fps=30.0))
-    assert run(*animate(model, tmp_path / "slow.npz", tmp_path / "slow")) == 0
-    motion_ = load_moving_body(tmp_path / "slow")[1]
-    assert motion_.fps == 60.0
-    assert len(motion_.frame_ids) == 19
-
-
-# --- what is wrong
-
-
-def test_takes_that_do_not_fit_together_are_one_line(works, write_work, motion, make_world, tmp_path, capsys) -> None:
+def test_takes_that_do_not_fit_together_are_one_line(
+    works, write_work, motion, make_world, tmp_path, quick, capsys
+) -> None:
     world = make_world()
     faces = world.garment.template.faces[:-1].copy()
     template = replace(world.garment.template, faces=faces, uv=None)
     other = write_work(tmp_path / "take8", motion(10, 7))
     save_garment(other / "registration" / "garment.npz", replace(world.garment, template=template))
-    line = fails(capsys, "fit", *works, other, "--output", tmp_path / "x", *QUICK)
+    line = fails(capsys, "fit", *works, other, "--output", tmp_path / "x", *quick)
     assert "take8: expected the template of" in line
     slow = write_work(tmp_path / "take7", replace(motion(10, 7), fps=30.0))
-    assert "expected 60 frames a second" in fails(capsys, "fit", *works, slow, "--output", tmp_path / "y", *QUICK)
+    assert "expected 60 frames a second" in fails(capsys, "fit", *works, slow, "--output", tmp_path / "y", *quick)
     weights = world.garment.skin_weights[:, ::-1].copy()
     anew = write_work(tmp_path / "take6", motion(10, 7))
     save_garment(anew / "registration" / "garment.npz", replace(world.garment, skin_weights=weights))
-    line = fails(capsys, "fit", *works, anew, "--output", tmp_path / "v", *QUICK)
+    line = fails(capsys, "fit", *works, anew, "--output", tmp_path / "v", *quick)
     assert "take6: expected the skin weights of" in line
     assert "--output: expected" in fails(capsys, "fit", *works)
     assert "found take0, take0" in fails(capsys, "fit", works[0], works[0], "--output", tmp_path / "z")
     assert "run: capture4d run" in fails(capsys, "fit", tmp_path / "nothing")
-    line = fails(capsys, "fit", works[0], "--output", tmp_path / "w", "--split.held-out", "take9", *QUICK)
+    line = fails(capsys, "fit", works[0], "--output", tmp_path / "w", "--split.held-out", "take9", *quick)
     assert "found 'take9'" in line
 
 
-def test_a_take_with_one_frame_is_one_line(write_work, motion, tmp_path, capsys) -> None:
+def test_a_take_with_one_frame_is_one_line(write_work, motion, tmp_path, quick, capsys) -> None:
     single = write_work(tmp_path / "single", motion(1, 0))
-    assert "at least 2 good frames to learn from, found 1 of 1" in fails(capsys, "fit", single, *QUICK)
-
-
-def test_poses_of_another_skeleton_are_one_line(model: Path, motion, tmp_path: Path, capsys) -> None:
-    poses = motion(4, 0)
-    save_poses(tmp_path / "other.npz", replace(poses, joint_names=("hip", "knee", "foot")))
-    line = fails(capsys, *animate(model, tmp_path / "other.npz", tmp_path / "x"))
-    assert "other.npz" in line
-    assert "joints" in line
-    body = load_body(model / "body.npz")
-    save_body(tmp_path / "body.npz", replace(body, joint_names=("hip", "knee", "foot")))
-    save_poses(tmp_path / "poses.npz", poses)
-    line = fails(capsys, *animate(model, tmp_path / "poses.npz", tmp_path / "x", "--body", tmp_path / "body.npz"))
-    assert "body.npz: body: expected the 3 joints of the model" in line
-    assert "at most 2" in fails(capsys, *animate(model, tmp_path / "poses.npz", tmp_path / "x", "--beta", *"1111"))
-    assert "finite" in fails(capsys, *animate(model, tmp_path / "poses.npz", tmp_path / "x", "--beta", "nan"))
-
-
-def test_a_tracked_take_is_never_written_over(model: Path, works, tmp_path: Path, capsys) -> None:
-    poses = works[0] / "body" / "poses.npz"
-    assert "found a take with a tracked body" in fails(capsys, *animate(model, poses, works[1]))
-    shutil.copytree(works[1] / "registration", tmp_path / "registered" / "registration")
-    assert "found output of 'register'" in fails(capsys, *animate(model, poses, tmp_path / "registered"))
+    assert "at least 2 good frames to learn from, found 1 of 1" in fails(capsys, "fit", single, *quick)
 
 
 @pytest.mark.parametrize(
@@ -307,133 +108,61 @@ def test_a_tracked_take_is_never_written_over(model: Path, works, tmp_path: Path
         (("--split.held-out", "take9"), "found 'take9'"),
     ],
 )
-def test_wrong_settings_leave_nothing_behind(works, tmp_path: Path, capsys, wrong: tuple[str, str], said: str) -> None:
-    assert said in fails(capsys, "fit", *works, "--output", tmp_path / "x", *QUICK, *wrong)
+def test_wrong_settings_leave_nothing_behind(
+    works, tmp_path: Path, quick, capsys, wrong: tuple[str, str], said: str
+) -> None:
+    assert said in fails(capsys, "fit", *works, "--output", tmp_path / "x", *quick, *wrong)
     assert not (tmp_path / "x" / "retarget" / "stage.json").exists()
 
 
-def test_takes_in_another_order_are_the_same_takes(model: Path, works) -> None:
+def test_takes_in_another_order_are_the_same_takes(model: Path, works, quick) -> None:
     """What an earlier run left is not read as somebody else's."""
     before = {path.name: path.read_bytes() for path in model.glob("*.safetensors")}
     shutil.rmtree(model)
     backwards = ("fit", *works[::-1], "--output", model.parent, "--split.validation", "take2", "--licence", "CC0")
-    assert run(*backwards, *QUICK) == 0
+    assert run(*backwards, *quick) == 0
     assert {path.name: path.read_bytes() for path in model.glob("*.safetensors")} == before
 
 
-def test_verdicts_belong_to_frames_not_to_lines(write_work, motion, tmp_path: Path, capsys) -> None:
+def test_verdicts_belong_to_frames_not_to_lines(write_work, motion, tmp_path: Path, quick, capsys) -> None:
     work = write_work(tmp_path / "short", motion(12, 0))
     lines = (work / "registration" / "metrics.jsonl").read_text().splitlines()
     (work / "registration" / "metrics.jsonl").write_text("\n".join(lines[3:]))
-    said = fails(capsys, "fit", work, "--output", tmp_path / "x", *QUICK)
+    said = fails(capsys, "fit", work, "--output", tmp_path / "x", *quick)
     assert "metrics.jsonl: frame 1: expected a verdict, found none" in said
 
 
-def test_a_body_tracked_anew_wants_a_new_registration(write_work, motion, tmp_path: Path, capsys) -> None:
+def test_a_body_tracked_anew_wants_a_new_registration(write_work, motion, tmp_path: Path, quick, capsys) -> None:
     work = write_work(tmp_path / "take", motion(12, 0))
     record = read_json(work / "body" / "stage.json")
     write_json(work / "body" / "stage.json", {**record, "digest": "another"})
-    said = fails(capsys, "fit", work, "--output", tmp_path / "x", *QUICK)
+    said = fails(capsys, "fit", work, "--output", tmp_path / "x", *quick)
     assert "expected the body with which it was registered" in said
 
 
-def test_a_damaged_registration_is_one_line(write_work, motion, tmp_path: Path, capsys) -> None:
+def test_a_damaged_registration_is_one_line(write_work, motion, tmp_path: Path, quick, capsys) -> None:
     work = write_work(tmp_path / "take", motion(12, 0))
     for name, said in (("frames/000003.npz", "not a readable npz file"), ("vertices.npy", "found a damaged file")):
         path = work / "registration" / name
         whole = path.read_bytes()
         path.write_bytes(whole[: len(whole) // 2])
-        assert said in fails(capsys, "fit", work, "--output", tmp_path / "x", *QUICK)
+        assert said in fails(capsys, "fit", work, "--output", tmp_path / "x", *quick)
         path.write_bytes(whole)
 
 
-def test_a_motion_in_disorder_is_one_line(model: Path, motion, tmp_path: Path, capsys) -> None:
-    poses = motion(4, 0)
-    save_poses(tmp_path / "poses.npz", replace(poses, frame_ids=poses.frame_ids[::-1].copy()))
-    said = fails(capsys, *animate(model, tmp_path / "poses.npz", tmp_path / "x"))
-    assert "expected frames with ascending numbers, found 4 frames in disorder" in said
-
-
-def test_a_body_of_other_faces_leaves_nothing_behind(model: Path, works, tmp_path: Path, capsys) -> None:
-    body = load_body(model / "body.npz")
-    turned = replace(body, template=replace(body.template, faces=body.template.faces[::-1].copy(), uv=None))
-    save_body(tmp_path / "body.npz", turned)
-    poses, output = works[0] / "body" / "poses.npz", tmp_path / "x"
-    assert "faces" in fails(capsys, *animate(model, poses, output, "--body", tmp_path / "body.npz"))
-    assert run(*animate(model, poses, output)) == 0
-
-
-def test_a_device_that_is_not_there_is_one_line(model: Path, works, tmp_path: Path, capsys) -> None:
-    poses = works[0] / "body" / "poses.npz"
-    said = fails(capsys, *animate(model, poses, tmp_path / "x", "--regressor", "lstm", "--device", "nonsense"))
-    assert "device: expected one that torch can use" in said
-
-
-def test_an_unfinished_model_is_not_animated_and_lost_files_are_made_again(
-    model: Path, works, tmp_path: Path, capsys
+def test_poses_and_frames_of_a_take_are_read_once(
+    works, quick, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    poses = works[0] / "body" / "poses.npz"
-    kernel = (model / "kernel.safetensors").read_bytes()
-    (model / "kernel.safetensors").unlink()
-    again = ("fit", *works, "--output", model.parent, "--split.validation", "take2", "--licence", "CC0", *QUICK)
-    assert run(*again) == 0
-    assert (model / "kernel.safetensors").read_bytes() == kernel
-    record = read_json(model / "stage.json")
-    write_json(model / "stage.json", {**record, "status": "running"})
-    assert "'fit' is not finished" in fails(capsys, *animate(model, poses, tmp_path / "x"))
+    read: list[str] = []
 
+    def counted(function):
+        def counting(path: Path):
+            read.append(f"{path.parent.name}/{path.name}")
+            return function(path)
 
-def test_damaged_models_are_one_line(model: Path, works, tmp_path: Path, capsys) -> None:
-    poses = works[0] / "body" / "poses.npz"
-    path = model / "blendshapes.safetensors"
-    whole = path.read_bytes()
-    path.write_bytes(whole[:-50])
-    assert "blendshapes.safetensors: not a readable safetensors file" in fails(
-        capsys, *animate(model, poses, tmp_path / "x")
-    )
-    path.write_bytes(pickle.dumps({"mean": [1, 2, 3]}))
-    assert "found a pickle" in fails(capsys, *animate(path, poses, tmp_path / "x"))
-    path.write_bytes(whole)
-    assert "expected a model" in fails(capsys, *animate(tmp_path / "nowhere", poses, tmp_path / "x"))
+        return counting
 
-    file = read_tensors(path, "capture4d blendshapes")
-    note = {key: value for key, value in file.note.items() if key != "kind"}
-    broken = {**file.tensors, "basis": np.full_like(file["basis"], np.nan)}
-    write_tensors(path, "capture4d blendshapes", broken, note)
-    assert "found NaN or inf" in fails(capsys, *animate(model, poses, tmp_path / "x"))
-    fewer = {**file.tensors, "template_vertices": file["template_vertices"][:-1]}
-    write_tensors(path, "capture4d blendshapes", fewer, note)
-    assert "expected indices from 0 to 278" in fails(capsys, *animate(model, poses, tmp_path / "x"))
-    write_tensors(path, "capture4d blendshapes", {**file.tensors, "std": 2 * file["std"]}, note)
-    assert "of another model" in fails(capsys, *animate(model, poses, tmp_path / "x"))
-    path.write_bytes(whole)
-
-    linear = read_tensors(model / "linear.safetensors", "capture4d linear regressor")
-    entries = {key: value for key, value in linear.note.items() if key != "kind"}
-    spoilt = {**linear.tensors, "intercept": np.full_like(linear["intercept"], np.nan)}
-    write_tensors(model / "linear.safetensors", "capture4d linear regressor", spoilt, entries)
-    assert "found NaN or inf in 'intercept'" in fails(capsys, *animate(model, poses, tmp_path / "x"))
-
-
-# --- splits
-
-
-def test_takes_are_given_whole_and_all_of_them() -> None:
-    names, lengths = [f"t{i}" for i in range(10)], [100] * 10
-    pieces = split_takes(names, lengths, 60.0, SplitConfig(held_out=("t3",), validation_share=0.2))
-    assert sorted(piece.take for piece in pieces) == list(range(10))
-    assert all(piece.frames == range(100) for piece in pieces)
-    roles = [piece.role for piece in sorted(pieces, key=lambda piece: piece.take)]
-    assert roles[3] == "held out"
-    assert roles.count("validation") == 2
-    assert pieces == split_takes(names, lengths, 60.0, SplitConfig(held_out=("t3",), validation_share=0.2))
-
-
-def test_a_single_take_is_cut_with_a_gap() -> None:
-    training, validation = split_takes(["only"], [600], 60.0, SplitConfig(gap_s=0.5, validation_share=0.1))
-    assert training.frames == range(510)
-    assert validation.frames == range(540, 600)
-    (whole,) = split_takes(["only"], [3], 60.0, SplitConfig())
-    assert whole.role == "training"
-    with pytest.raises(InputError, match="all set aside"):
-        split_takes(["only"], [30], 60.0, SplitConfig(held_out=("only",)))
+    monkeypatch.setattr(work_folder, "load_poses", counted(work_folder.load_poses))
+    monkeypatch.setattr(fit_takes, "load_registration", counted(fit_takes.load_registration))
+    assert run("fit", *works, "--output", tmp_path / "out", *quick, "--regressor", "linear") == 0
+    assert sorted(read) == sorted(["body/poses.npz"] * 3 + [f"{work.name}/registration" for work in works])

@@ -18,7 +18,7 @@ from capture4d.errors import InputError
 from capture4d.files.atomic import write_bytes
 from capture4d.files.tensors import read_tensors, write_tensors
 from capture4d.types import PoseSequence
-from retarget.config import ControlConfig, KernelConfig, LinearConfig, LstmConfig, TrainingConfig
+from retarget.config import ControlConfig, FitConfig, KernelConfig, LinearConfig, LstmConfig, TrainingConfig
 from retarget.regression.controls import ControlLayout, control_vectors
 from retarget.regression.ensemble import ensemble
 from retarget.regression.kernel import fit_kernel, load_kernel, save_kernel
@@ -29,7 +29,7 @@ from retarget.regression.training import fit_lstm, train_lstm
 
 NAMES = ("root", "middle", "top")
 SMALL = LstmConfig(layers=2, size=24, over_linear=False)
-QUICK = TrainingConfig(epochs=6, batch=16, patience=10)
+QUICK = FitConfig(lstm=SMALL, training=TrainingConfig(epochs=6, batch=16, patience=10))
 
 
 def layout(**settings) -> ControlLayout:
@@ -110,11 +110,10 @@ def test_streaming_equals_batch(clips, kind: str, history: int, tmp_path: Path) 
     if kind == "kernel":
         found = fit_kernel(FittingClips.create(known[:3], known[3:]), chosen, spread(known), KernelConfig())
     elif kind != "linear":
-        config = LstmConfig(layers=2, size=16, over_linear=kind == "over linear")
-        training = TrainingConfig(epochs=2)
-        found = train_lstm(
-            known[:3], known[3:], chosen, spread(known), tmp_path, lstm=config, config=training, linear=linear
-        )
+        network = LstmConfig(layers=2, size=16, over_linear=kind == "over linear")
+        config = FitConfig(lstm=network, training=TrainingConfig(epochs=2))
+        lesson = FittingClips.create(known[:3], known[3:])
+        found = train_lstm(lesson, chosen, spread(known), tmp_path, config, linear=linear).regressor
     whole = found.predict(known[3].controls)
     stream = found.stream()
     again = np.stack([stream.push(row) for row in known[3].controls])
@@ -125,7 +124,7 @@ def test_kernels_and_network_are_one_that_sees_the_controls_of_both(motion, clip
     wide = layout(whole_rotations=True, lags=(6, 18))
     known, plain = clips(chosen=wide), clips()
     kernel = fit_kernel(FittingClips.create(known), wide, spread(known), KernelConfig())
-    network = train_lstm(plain, (), layout(), spread(plain), tmp_path, lstm=SMALL, config=QUICK)
+    network = train_lstm(FittingClips.create(plain), layout(), spread(plain), tmp_path, QUICK).regressor
     both = ensemble(kernel, network)
     assert both is not None
     wanted = 0.75 * kernel.predict(known[3].controls) + 0.25 * network.predict(plain[3].controls)
@@ -175,10 +174,9 @@ def test_running_freely_does_not_drift(clips, tmp_path: Path) -> None:
     for history in (0, 2):
         chosen = layout(history=history)
         known = clips(chosen=chosen)
-        linear = fit_linear(FittingClips(known[:3], known[3:], known[:3]), chosen, spread(known), LinearConfig())
-        network = train_lstm(
-            known[:3], known[3:], chosen, spread(known), tmp_path / str(history), lstm=SMALL, config=QUICK
-        )
+        lesson = FittingClips(known[:3], known[3:], known[:3])
+        linear = fit_linear(lesson, chosen, spread(known), LinearConfig())
+        network = train_lstm(lesson, chosen, spread(known), tmp_path / str(history), QUICK).regressor
         loop = np.tile(known[3].controls[:50], (20, 1))
         for regressor in (linear, network) if history else (network,):  # those that carry something on
             said = regressor.predict(loop).reshape(20, 50, -1)
@@ -199,12 +197,13 @@ def bending(frames: int, seed: int) -> Clip:
 
 def test_the_network_learns_what_a_line_cannot(tmp_path: Path) -> None:
     known = [bending(80, seed) for seed in range(4)]
-    linear = fit_linear(FittingClips(known[:3], known[3:], known[:3]), layout(), spread(known), LinearConfig())
-    network = train_lstm(
-        known[:3], known[3:], layout(), spread(known), tmp_path,
+    lesson = FittingClips(known[:3], known[3:], known[:3])
+    linear = fit_linear(lesson, layout(), spread(known), LinearConfig())
+    config = FitConfig(
         lstm=LstmConfig(layers=1, size=32, over_linear=False),
-        config=TrainingConfig(epochs=30, batch=16, learning_rate=1e-2),
-    )  # fmt: skip
+        training=TrainingConfig(epochs=30, batch=16, learning_rate=1e-2),
+    )
+    network = train_lstm(lesson, layout(), spread(known), tmp_path, config).regressor
     backwards = Clip(known[3].controls[::-1].copy(), known[3].coefficients[::-1].copy(), known[3].good)
     for clip in (known[3], backwards):
         assert mean_squared_error(network, [clip]) < 0.65 * mean_squared_error(linear, [clip])
@@ -274,11 +273,10 @@ def test_the_network_ends_with_all_clips_for_as_long_as_it_took_to_validate(clip
     known = clips(frames=20)
     lesson = FittingClips.create(known[:2], known[2:])
     linear = fit_linear(lesson, layout(), spread(known), LinearConfig())
-    config = TrainingConfig(epochs=8, batch=16, patience=3)
+    config = FitConfig(lstm=SMALL, training=TrainingConfig(epochs=8, batch=16, patience=3))
 
     def go(name: str, clips: FittingClips) -> list[dict]:
-        fit_lstm(clips, layout(), spread(known), tmp_path / name, lstm=SMALL, config=config, linear=linear,
-                 linear_config=LinearConfig())  # fmt: skip
+        fit_lstm(clips, layout(), spread(known), tmp_path / name, config, linear=linear)
         lines = (tmp_path / name / "final" / "metrics.jsonl").read_text().splitlines()
         return [json.loads(line) for line in lines]
 
@@ -293,12 +291,14 @@ def test_the_network_ends_with_all_clips_for_as_long_as_it_took_to_validate(clip
 def test_training_stops_early_and_keeps_the_best(clips, tmp_path: Path) -> None:
     known = clips(frames=20, count=2)
     noise = Clip(known[1].controls, -known[1].coefficients, known[1].good)
-    config = TrainingConfig(epochs=200, patience=3, learning_rate=5e-3)
-    found = train_lstm(known[:1], [noise], layout(), spread(known), tmp_path, lstm=SMALL, config=config)
+    config = FitConfig(lstm=SMALL, training=TrainingConfig(epochs=200, patience=3, learning_rate=5e-3))
+    lesson = FittingClips.create(known[:1], [noise])
+    found, epochs = train_lstm(lesson, layout(), spread(known), tmp_path, config)
     lines = (tmp_path / "metrics.jsonl").read_text().splitlines()
     assert len(lines) < 200
     errors = [json.loads(line)["validation_mse_mm2"] for line in lines]
     assert 1e6 * mean_squared_error(found, [noise]) == pytest.approx(min(errors))
+    assert epochs == int(np.argmin(errors)) + 1
 
 
 def weights(regressor: LstmRegressor) -> dict[str, bytes]:
@@ -309,17 +309,17 @@ def weights(regressor: LstmRegressor) -> dict[str, bytes]:
 def test_a_run_that_stopped_anywhere_ends_with_the_same_bits(clips, tmp_path: Path, monkeypatch, fitted: bool) -> None:
     """The network alone, and as `fit` learns it: over a linear regression, with validation and then from all clips."""
     known = clips(count=3)
-    config = TrainingConfig(epochs=5, batch=16, checkpoint_s=0.0, teacher_forcing=0.5)
-    lesson, over = FittingClips.create(known[:2], known[2:]), LstmConfig(layers=2, size=24)
+    config = FitConfig(
+        lstm=LstmConfig(layers=2, size=24, over_linear=fitted),
+        training=TrainingConfig(epochs=5, batch=16, checkpoint_s=0.0, teacher_forcing=0.5),
+    )
+    lesson = FittingClips.create(known[:2], known[2:])
     linear = fit_linear(lesson, layout(), spread(known), LinearConfig())
 
     def go(folder: Path) -> LstmRegressor:
         if fitted:
-            return fit_lstm(
-                lesson, layout(), spread(known), folder,
-                lstm=over, config=config, linear=linear, linear_config=LinearConfig(),
-            )  # fmt: skip
-        return train_lstm(known[:2], known[2:], layout(), spread(known), folder, lstm=SMALL, config=config)
+            return fit_lstm(lesson, layout(), spread(known), folder, config, linear=linear)
+        return train_lstm(lesson, layout(), spread(known), folder, config).regressor
 
     whole = go(tmp_path / "whole")
     step = torch.optim.Adam.step
@@ -359,12 +359,12 @@ rng = np.random.default_rng(0)
 layout = ControlLayout(("root", "a"), (1,), 60.0, ControlConfig())
 controls = rng.standard_normal((400, layout.size)).astype(np.float32)
 clip = Clip(controls, np.sin(controls[:, :3]), np.ones(400, bool))
-found = train_lstm(
-    [clip], [clip], layout, np.ones(3), pathlib.Path(sys.argv[1]),
+config = FitConfig(
     lstm=LstmConfig(layers=2, size=32, over_linear=False),
-    config=TrainingConfig(epochs=12, batch=8, checkpoint_s=0.05),
+    training=TrainingConfig(epochs=12, batch=8, checkpoint_s=0.05),
 )
-save_lstm(pathlib.Path(sys.argv[1]) / "done.safetensors", found, model_digest="x")
+found = train_lstm(FittingClips([clip], [clip], [clip]), layout, np.ones(3), pathlib.Path(sys.argv[1]), config)
+save_lstm(pathlib.Path(sys.argv[1]) / "done.safetensors", found.regressor, model_digest="x")
 """
 
 
@@ -397,10 +397,9 @@ def test_files_come_back_as_they_were_and_wrong_ones_are_one_line(clips, tmp_pat
     known, chosen = clips(count=2), layout(up=True, lags=(4,))
     known = clips(count=2, chosen=chosen)
     linear = fit_linear(FittingClips(known[:1], known[1:], known[:1]), chosen, spread(known), LinearConfig())
-    config = LstmConfig(layers=1, size=8, over_linear=True)
-    network = train_lstm(
-        known[:1], known[1:], chosen, spread(known), tmp_path, lstm=config, config=QUICK, linear=linear
-    )
+    config = replace(QUICK, lstm=LstmConfig(layers=1, size=8, over_linear=True))
+    lesson = FittingClips.create(known[:1], known[1:])
+    network = train_lstm(lesson, chosen, spread(known), tmp_path, config, linear=linear).regressor
     save_linear(tmp_path / "linear.safetensors", linear, model_digest="m")
     save_lstm(tmp_path / "lstm.safetensors", network, model_digest="m")
     kernel = fit_kernel(FittingClips.create(known), chosen, spread(known), KernelConfig())
@@ -436,4 +435,18 @@ def test_files_come_back_as_they_were_and_wrong_ones_are_one_line(clips, tmp_pat
 def test_an_unknown_device_is_one_line(clips, tmp_path: Path) -> None:
     known = clips(count=2)
     with pytest.raises(InputError, match="device: expected one that torch can use"):
-        train_lstm(known[:1], known[1:], layout(), spread(known), tmp_path, lstm=SMALL, config=QUICK, device="nonsense")
+        train_lstm(FittingClips.create(known), layout(), spread(known), tmp_path, QUICK, device="nonsense")
+
+
+def test_a_checkpoint_that_cannot_be_continued_is_one_line(clips, tmp_path: Path) -> None:
+    known = clips(count=1, frames=20)
+    lesson = FittingClips.create(known)
+    path = tmp_path / "checkpoints" / "last.safetensors"
+    train_lstm(lesson, layout(), spread(known), tmp_path, QUICK)
+    wider = replace(QUICK, lstm=replace(SMALL, size=25))
+    with pytest.raises(InputError, match=r"weights of another architecture: .*; to start anew: capture4d fit .*--over"):
+        train_lstm(lesson, layout(), spread(known), tmp_path, wider)
+    write_tensors(path, "capture4d training checkpoint", {}, {})  # as versions wrote them that had another format
+    with pytest.raises(InputError, match=r"expected capture4d lstm training, found .*to start anew") as no:
+        train_lstm(lesson, layout(), spread(known), tmp_path, QUICK)
+    assert str(no.value).startswith(f"{path}: ")

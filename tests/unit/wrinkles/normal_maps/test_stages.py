@@ -16,7 +16,7 @@ import safetensors.torch
 import torch
 from scipy.spatial.transform import Rotation
 
-from capture4d.files.atomic import write_bytes, write_npy, write_npz
+from capture4d.files.atomic import read_json, write_bytes, write_json, write_npy, write_npz
 from capture4d.files.records import load_garment, save_garment
 from capture4d.geometry.mesh import submesh
 from capture4d.runs.stage import open_stage
@@ -59,6 +59,14 @@ def trained(trained_once: Path, tmp_path: Path) -> Path:
     """A trained model, and the work folder it learned from at `work` beside it."""
     shutil.copytree(trained_once, tmp_path, dirs_exist_ok=True)
     return tmp_path / "model"
+
+
+@pytest.fixture
+def unfinished(trained: Path) -> Path:
+    """The model, stopped after its last checkpoint."""
+    record = read_json(trained / "stage.json")
+    write_json(trained / "stage.json", {**record, "status": "running"})
+    return trained
 
 
 @pytest.fixture
@@ -266,13 +274,16 @@ def test_a_killed_training_ends_with_the_same_weights(work: Path, tmp_path: Path
 
 
 def test_a_checkpoint_of_another_architecture(
-    work: Path, trained: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    work: Path, unfinished: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ):
+    trained = unfinished
     other = tmp_path / "other"
     assert run(*train(work, other, "--network.filters", "2")) == 0
     last = "checkpoints/000006.safetensors"
     (trained / last).write_bytes((other / last).read_bytes())
-    assert "another architecture" in fails(capsys, *train(work, trained))
+    line = fails(capsys, *train(work, trained))
+    assert f"{trained / last}: weights of another architecture: 'down.0.0.weight', expected (4, " in line
+    assert line.endswith("; to start anew: capture4d wrinkles train ... --overwrite")
     damaged = (trained / "generator.safetensors").read_bytes()[:-100]
     (trained / "generator.safetensors").write_bytes(damaged)
     assert "generator.safetensors: not a readable safetensors" in fails(capsys, "wrinkles", "apply", trained, work)
@@ -280,13 +291,24 @@ def test_a_checkpoint_of_another_architecture(
     assert "no such file" in fails(capsys, "wrinkles", "apply", tmp_path / "nowhere", work)
 
 
-def test_the_newest_checkpoint_is_the_one_with_the_most_steps(work: Path, trained: Path):
+def test_the_newest_checkpoint_is_the_one_with_the_most_steps(work: Path, unfinished: Path):
     """Past a million steps names are longer, and text sorts them wrongly."""
-    folder = trained / "checkpoints"
+    folder = unfinished / "checkpoints"
     (folder / "000006.safetensors").rename(folder / "1000000.safetensors")
     (folder / "000004.safetensors").rename(folder / "999500.safetensors")
     (folder / "999500.safetensors").write_bytes(b"damaged")
+    assert run(*train(work, unfinished)) == 0
+
+
+def test_a_finished_model_needs_no_checkpoint(work: Path, trained: Path):
+    """Nor does it matter in which earlier layout there is one."""
+    before = {name: (trained / name).read_bytes() for name in ("generator.safetensors", "held_out.json")}
+    digest = read_json(trained / "stage.json")["digest"]
+    for path in (trained / "checkpoints").iterdir():
+        path.write_bytes(b"of an earlier version")
     assert run(*train(work, trained)) == 0
+    assert {name: (trained / name).read_bytes() for name in before} == before
+    assert read_json(trained / "stage.json")["digest"] == digest
 
 
 @pytest.mark.parametrize(
@@ -314,25 +336,24 @@ def test_settings_out_of_range_leave_nothing_behind(
     assert not (tmp_path / "model" / "stage.json").exists()
 
 
-def test_damaged_notes_are_named(work: Path, trained: Path, capsys: pytest.CaptureFixture[str]):
-    (trained / "metrics.jsonl").write_text('{"step": 2}\n{"step"')
-    assert "metrics.jsonl: line 2: not valid JSON" in fails(capsys, *train(work, trained))
+def test_damaged_notes_are_named(work: Path, unfinished: Path, capsys: pytest.CaptureFixture[str]):
+    (unfinished / "metrics.jsonl").write_text('{"step": 2}\n{"step"')
+    assert "metrics.jsonl: line 2: not valid JSON" in fails(capsys, *train(work, unfinished))
     (work / "registration" / "metrics.jsonl").write_text("[1]\n")
     line = fails(capsys, "wrinkles", "maps", work, "--map.size", "32", "--overwrite", "--workers", "1")
     assert "metrics.jsonl: line 1: expected a JSON object, found list" in line
 
 
-def test_a_checkpoint_that_is_not_whole(work: Path, trained: Path, capsys: pytest.CaptureFixture[str]):
-    path = trained / "checkpoints" / "000006.safetensors"
-    tensors = safetensors.torch.load(path.read_bytes())
-    moment = "generator_optimizer.0.exp_avg"
-    for name, change, said in (
-        ("random", {}, "expected a whole checkpoint, found one without 'random'"),
-        (moment, {moment: torch.zeros(3)}, f"'{moment}': expected"),
-    ):
-        kept = {key: value for key, value in tensors.items() if key != name}
-        path.write_bytes(safetensors.torch.save(kept | change))
-        assert said in fails(capsys, *train(work, trained))
+def test_a_checkpoint_that_cannot_be_continued(work: Path, unfinished: Path, capsys: pytest.CaptureFixture[str]):
+    path = unfinished / "checkpoints" / "000006.safetensors"
+    whole = path.read_bytes()
+    earlier = safetensors.torch.save({"step": torch.tensor(6)})  # as versions wrote them that had another format
+    for written, said in ((whole[:-10], "cut off or damaged"), (earlier, "expected capture4d wrinkle training, found")):
+        path.write_bytes(written)
+        line = fails(capsys, *train(work, unfinished))
+        assert f"{path}: " in line
+        assert said in line
+        assert line.endswith("to start anew: capture4d wrinkles train ... --overwrite")
 
 
 def test_a_mask_of_another_size(work: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -16,7 +16,7 @@ from capture4d.cli.main import main
 from capture4d.errors import InputError
 from capture4d.files.records import save_body, save_poses
 from capture4d.types import PoseSequence, Scan
-from retarget.garment_model import load_garment_model
+from retarget.animation.garment_model import load_garment_model
 from tests.unit.wrinkles.conftest import make_work, outside_the_unit_square, some_garment, some_scan
 from tests.unit.wrinkles.normal_maps.test_stages import SMALL
 from tests.unit.wrinkles.offset_images.test_layout import limb, upright
