@@ -21,6 +21,7 @@ import tyro
 
 from capture4d.cli.capture import Calibrate, Check, CheckRig
 from capture4d.cli.demo import Demo
+from capture4d.cli.doctor import Doctor
 from capture4d.cli.exit_codes import BAD_COMMAND_LINE, BAD_INPUT, GOOD, INTERRUPTED, TERMINATED
 from capture4d.cli.faults import check_command
 from capture4d.cli.files import ConvertBody, ConvertPoses, ConvertRig, RegisterMesh, Template
@@ -73,6 +74,7 @@ COMMANDS: Mapping[str, Any] = {
     "convert-body": ConvertBody,
     "convert-rig": ConvertRig,
     "convert-poses": ConvertPoses,
+    "doctor": Doctor,
 }
 
 _PRESETS: Mapping[Any, Mapping[str, Any]] = {

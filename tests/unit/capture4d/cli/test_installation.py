@@ -1,0 +1,128 @@
+"""`capture4d doctor` says what is there, what is missing, and what breaks as it is loaded."""
+
+import json
+import os
+from importlib.metadata import PackageNotFoundError
+from pathlib import Path
+
+import pytest
+
+from capture4d.cli import installation
+from capture4d.cli.installation import Part, diagnose, load_apart
+from capture4d.cli.main import main
+
+
+def run(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as exit_:
+        main(["doctor", *arguments])
+    return int(exit_.value.code or 0)
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("CAPTURE4D_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+@pytest.fixture
+def needs(monkeypatch: pytest.MonkeyPatch):
+    """Say what capture4d needs."""
+
+    def say(*entries: str) -> None:
+        monkeypatch.setattr(installation, "requires", lambda _: list(entries))
+
+    return say
+
+
+@pytest.fixture
+def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Write a module that processes of ours find."""
+    folder = tmp_path / "modules"
+    folder.mkdir()
+    monkeypatch.setenv("PYTHONPATH", str(folder))
+
+    def write(name: str, source: str) -> None:
+        (folder / f"{name}.py").write_text(source)
+
+    return write
+
+
+def test_a_sound_installation_is_exit_0_and_names_its_parts(needs, capsys: pytest.CaptureFixture[str]):
+    needs("numpy>=2", "pillow>=1", "pytest; extra == 'dev'", "nothing-here; sys_platform == 'amiga'")
+    assert run() == 0
+    said = capsys.readouterr()
+    assert "numpy" in said.out
+    assert "pillow" in said.out
+    assert "nothing-here" not in said.out  # for another system
+    assert "\n  pytest" not in said.out  # for development
+    assert said.err == ""
+
+
+def test_a_missing_part_is_exit_3_and_one_line(needs, capsys: pytest.CaptureFixture[str]):
+    needs("numpy>=2", "no-such-distribution>=1")
+    assert run("--no-load") == 3
+    assert capsys.readouterr().err == "capture4d: no-such-distribution: missing\n"
+
+
+def test_another_version_than_wanted_is_said_and_does_not_fail(needs, capsys: pytest.CaptureFixture[str]):
+    needs("numpy<1")
+    assert run("--no-load") == 0
+    assert "other version (wanted <1)" in capsys.readouterr().out
+
+
+def test_an_optional_part_may_be_missing(needs, monkeypatch: pytest.MonkeyPatch):
+    needs()
+    monkeypatch.setattr(installation, "OPTIONAL", {"no-such-distribution": "dreams"})
+    diagnosis = diagnose(load=False)
+    assert diagnosis.parts == (Part("no-such-distribution", False, "missing", None, "dreams"),)
+    assert diagnosis.faults == []
+
+
+def test_what_is_not_installed_says_so(monkeypatch: pytest.MonkeyPatch):
+    def none(_: str) -> None:
+        raise PackageNotFoundError
+
+    monkeypatch.setattr(installation, "requires", none)
+    assert "not installed" in diagnose(load=False).faults[0]
+
+
+def test_a_part_that_kills_its_process_is_named_and_the_rest_is_loaded(module):
+    module("crashes", "import os; os._exit(11)")
+    module("raises", "raise OSError('libGL.so: no such file,\\n really')")
+    module("sound", "print('hello')")
+    faults, _ = load_apart(["raises", "crashes", "sound"])
+    assert faults == {
+        "raises": "OSError: libGL.so: no such file, really",
+        "crashes": "its process ended with 11 while it was loaded",
+        "sound": "",
+    }
+
+
+def test_files_of_the_current_folder_are_not_taken_for_parts(module, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    module("sound", "")
+    (tmp_path / "sound.py").write_text("raise ImportError('the wrong one')")
+    monkeypatch.chdir(tmp_path)
+    assert load_apart(["sound"])[0] == {"sound": ""}
+
+
+def test_a_cache_folder_that_cannot_be_written_is_exit_3(needs, own_cache: Path, capsys: pytest.CaptureFixture[str]):
+    needs()
+    own_cache.write_text("a file")
+    assert run("--no-load") == 3
+    assert f"cache folder {own_cache}: " in capsys.readouterr().err
+
+
+def test_the_size_of_the_cache_is_that_of_its_files(needs, own_cache: Path):
+    needs()
+    (own_cache / "deep").mkdir(parents=True)
+    (own_cache / "deep" / "body.npz").write_bytes(bytes(3_000_000))
+    assert diagnose(load=False).cache.mb == 3.0
+
+
+def test_json_says_the_same(needs, capsys: pytest.CaptureFixture[str]):
+    needs("numpy>=2")
+    assert run("--no-load", "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["faults"] == []
+    assert {part["name"] for part in told["parts"]} == {"numpy", *installation.OPTIONAL}
+    assert told["machine"]["cores"] == len(os.sched_getaffinity(0))
