@@ -8,7 +8,7 @@
       rig.json                        cameras                                         [optional]
       truth/model.npz truth/000123.npz    exact surfaces, from the synthetic scanner  [optional]
 
-docs/conventions.md describes every file, so that it can be written without this package.
+docs/reference/files.md describes every file, so that it can be written without this package.
 """
 
 from __future__ import annotations
@@ -215,7 +215,7 @@ def read_capture(path: str | Path, *, scans: bool = True) -> Capture:
     if not path.is_dir():
         raise InputError("no such capture folder", where=path)
     if not description.is_file():
-        raise InputError("no such file; a capture folder needs one (see docs/conventions.md)", where=description)
+        raise InputError("no such file; a capture folder needs one (see docs/reference/files.md)", where=description)
     files = _list_files(path)
     found = parse_json(files.description, description)
     try:

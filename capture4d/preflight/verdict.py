@@ -1,8 +1,8 @@
 """What is wrong with a take, and what to do about it: numbers of its frames in, findings out.
 
 Every check gives a score, what was measured over what is tolerated: above 1 it is a finding. A finding names a cause
-once; what merely follows from it (no garment colour in a scan without colours) is not reported again. docs/preflight.md
-describes every finding, and where its limit comes from.
+once; what merely follows from it (no garment colour in a scan without colours) is not reported again.
+docs/reference/findings.md describes every finding.
 """
 
 from __future__ import annotations

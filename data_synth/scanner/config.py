@@ -1,7 +1,7 @@
 """Settings of the virtual 4D scanner: the rig, the sensor's noise, the fusion.
 
-The defaults come from measurements on a simulated T-shirt (see docs/scanner.md for the figures and the command that
-prints them). Lengths are metres unless the name says otherwise.
+The defaults come from measurements on a simulated T-shirt (see docs/methods/scanner.md for the figures and the command
+that prints them). Lengths are metres unless the name says otherwise.
 """
 
 from __future__ import annotations

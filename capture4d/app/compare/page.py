@@ -9,7 +9,7 @@ network             the registration with maps made by a trained generator
 offset images       vertices decoded from an image that a network predicts from the pose alone, learned here
 fully connected     the same with a fully connected network on principal components
 
-docs/wrinkles.md defines the measures.
+docs/methods/wrinkles.md defines the measures.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ def status(verdict: Verdict) -> Status:
 
 
 def as_json(checked: Checked, *, fixed: Path | None = None) -> dict[str, Any]:
-    """The verdict for machines; docs/preflight.md describes it."""
+    """The verdict for machines; docs/reference/findings.md describes it."""
     return {
         "format": 1,
         "capture": str(checked.take.path),

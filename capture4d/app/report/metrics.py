@@ -1,6 +1,6 @@
 """What the report says about a take: the metrics, from the frames' records and from the truth.
 
-docs/report.md explains them.
+docs/reference/report.md explains them.
 """
 
 from __future__ import annotations

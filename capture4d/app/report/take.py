@@ -1,6 +1,6 @@
 """The report of a work folder: WORK/report/index.html, self-contained, and WORK/report/metrics.json.
 
-docs/report.md defines every metric. Those against truth appear where the capture has one.
+docs/reference/report.md defines every metric. Those against truth appear where the capture has one.
 """
 
 from __future__ import annotations
