@@ -34,8 +34,7 @@ def _install_shape_checks() -> None:
 _install_shape_checks()
 
 
-@pytest.fixture
-def tube_capture(tmp_path: Path) -> Path:
+def write_tube_capture(folder: Path) -> Path:
     """Three frames of a blue tube of cloth, 0.6 m long, that bends; its two borders are painted yellow.
 
     No body, no poses; the template is the same tube, unbent, with a tenth of the vertices.
@@ -53,7 +52,6 @@ def tube_capture(tmp_path: Path) -> Path:
         vertices = np.stack([0.15 * np.sin(angle) + shift, height, 0.15 * np.cos(angle)], axis=1)
         return Mesh(vertices.astype(np.float32), tube_faces(around, along))
 
-    folder = tmp_path / "capture"
     paint = {"neck": (255, 210, 0), "hem": (255, 210, 0)}
     capture = Capture(folder, "tube", 60.0, (5, 6, 7), (47, 98, 201), paint)
     for frame_id in capture.frame_ids:
@@ -66,3 +64,14 @@ def tube_capture(tmp_path: Path) -> Path:
     save_garment(folder / "template.npz", Garment(template, {"hem": hem, "neck": neck}))
     write_capture_description(capture)
     return folder
+
+
+@pytest.fixture
+def tube_capture(tmp_path: Path) -> Path:
+    return write_tube_capture(tmp_path / "capture")
+
+
+@pytest.fixture(scope="session")
+def tube_capture_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same for the whole session, to be copied or read."""
+    return write_tube_capture(tmp_path_factory.mktemp("tube") / "capture")

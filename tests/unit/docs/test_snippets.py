@@ -1,0 +1,99 @@
+"""What README and docs tell a reader to type works: Python is run, command lines are parsed."""
+
+import importlib
+import pkgutil
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import pytest
+from markdown_it import MarkdownIt
+
+import capture4d.cli
+from capture4d.cli.main import main
+
+ROOT = Path(__file__).parents[3]
+PAGES = {str(path.relative_to(ROOT)): path for path in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))}
+
+
+def blocks(page: str, language: str) -> list[tuple[int, str]]:
+    """Snippets of a page and the lines they begin in."""
+    tokens = MarkdownIt().parse(PAGES[page].read_text())
+    found = [token for token in tokens if token.type == "fence" and token.info.split()[:1] == [language]]
+    return [(token.map[0] + 2, token.content) for token in found if token.map]
+
+
+def commands(page: str) -> list[tuple[int, list[str]]]:
+    """Lines that run capture4d, without comments, redirections and what they are piped into."""
+    found = []
+    for first, block in blocks(page, "sh"):
+        for number, line in enumerate(block.splitlines(), first):
+            words = shlex.split(line, comments=True)
+            end = next((index for index, word in enumerate(words) if word in ("|", ">", "&&", ";")), len(words))
+            if words[:1] == ["capture4d"]:
+                found.append((number, words[1:end]))
+    return found
+
+
+LINES = [pytest.param(words, id=f"{page}:{line}") for page in PAGES for line, words in commands(page)]
+WITH_PYTHON = [page for page in PAGES if blocks(page, "python")]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", WITH_PYTHON)
+def test_python_runs(page: str, shop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The snippets of a page run one after the other, in a folder with what they name."""
+    shutil.copytree(shop, tmp_path / "shop")
+    monkeypatch.chdir(tmp_path / "shop")
+    names: dict[str, object] = {"__name__": "snippet"}
+    for line, source in blocks(page, "python"):
+        padded = "\n" * (line - 1) + source  # a traceback names the line of the page
+        exec(compile(padded, page, "exec"), names)
+
+
+@pytest.fixture
+def parse_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Commands are told what to do, and do not do it."""
+    for info in pkgutil.iter_modules(capture4d.cli.__path__):
+        for value in vars(importlib.import_module(f"capture4d.cli.{info.name}")).values():
+            if isinstance(value, type) and "__call__" in vars(value):
+                monkeypatch.setattr(value, "__call__", lambda _: 0)
+
+
+def run(words: list[str]) -> int:
+    with pytest.raises(SystemExit) as end:
+        main(words)
+    return int(end.value.code or 0)
+
+
+def names_of_commands(capsys: pytest.CaptureFixture[str]) -> list[str]:
+    run(["--help"])
+    return re.findall(r"^  ([a-z-]+(?: [a-z]+)?)  ", capsys.readouterr().out, re.MULTILINE)
+
+
+@pytest.mark.parametrize("words", LINES)
+def test_a_command_line_is_understood(words: list[str], parse_only: None, capsys: pytest.CaptureFixture[str]):
+    """The command exists and takes these options and values; it is not run."""
+    assert run(words) == 0, capsys.readouterr().err
+
+
+def test_a_wrong_line_is_found(parse_only: None):
+    assert run(["register", "capture", "--output", "work", "--no-such-option", "3"]) == 2
+    assert run(["synth", "take", "--preset", "no-such-preset"]) == 2
+    assert run(["no-such-command"]) == 2
+
+
+def test_there_is_something_to_test():
+    assert len(LINES) > 50
+    assert {"README.md", "docs/tutorial/python.md"} <= set(WITH_PYTHON)
+
+
+def test_the_readme_is_one_page_and_its_snippet_at_most_15_lines():
+    assert len(PAGES["README.md"].read_text().splitlines()) <= 90
+    assert [len(source.splitlines()) <= 15 for _, source in blocks("README.md", "python")] == [True]
+
+
+def test_the_table_of_commands_is_whole(capsys: pytest.CaptureFixture[str]):
+    table = PAGES["docs/reference/commands.md"].read_text()
+    assert sorted(re.findall(r"^\| `([a-z -]+)` \|", table, re.MULTILINE)) == sorted(names_of_commands(capsys))
