@@ -27,7 +27,7 @@ def shop(tube_capture_once: Path, write_work, motion, tmp_path_factory: pytest.T
     folder = tmp_path_factory.mktemp("docs") / "shop"
     shutil.copytree(tube_capture_once, folder / "capture")
     write_mesh(folder / "template.obj", load_garment(folder / "capture" / "template.npz").template)
-    write_mesh(folder / "scan.ply", read_mesh(folder / "capture" / "scans" / "000005.ply"))
+    write_mesh(folder / "scan.ply", read_mesh(folder / "capture" / "scans" / "000005.ply").mesh)
     save_poses(folder / "motion.npz", motion(8, 5))
     take = write_work(folder.parent / "take", motion(16, 1))
     quick = ("--shape.max-error-mm", "0.1", "--lstm.layers", "1", "--lstm.size", "16", "--training.epochs", "3")

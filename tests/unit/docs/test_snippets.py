@@ -20,7 +20,7 @@ PAGES = {str(path.relative_to(ROOT)): path for path in (ROOT / "README.md", *sor
 def blocks(page: str, language: str) -> list[tuple[int, str]]:
     """Snippets of a page and the lines they begin in."""
     tokens = MarkdownIt().parse(PAGES[page].read_text())
-    found = [token for token in tokens if token.type == "fence" and token.info.split()[:1] == [language]]
+    found = [token for token in tokens if token.type == "fence" and (token.info.split() or [""])[0] == language]
     return [(token.map[0] + 2, token.content) for token in found if token.map]
 
 
@@ -82,6 +82,11 @@ def test_a_wrong_line_is_found(parse_only: None):
     assert run(["register", "capture", "--output", "work", "--no-such-option", "3"]) == 2
     assert run(["synth", "take", "--preset", "no-such-preset"]) == 2
     assert run(["no-such-command"]) == 2
+
+
+def test_command_lines_are_said_to_be_some():
+    """A block without a language would not be looked at."""
+    assert [page for page in PAGES if any("capture4d " in text for _, text in blocks(page, ""))] == []
 
 
 def test_there_is_something_to_test():
