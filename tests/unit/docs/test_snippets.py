@@ -3,6 +3,7 @@
 import importlib
 import pkgutil
 import re
+import runpy
 import shlex
 import shutil
 from pathlib import Path
@@ -50,6 +51,18 @@ def test_python_runs(page: str, shop: Path, tmp_path: Path, monkeypatch: pytest.
     for line, source in blocks(page, "python"):
         padded = "\n" * (line - 1) + source  # a traceback names the line of the page
         exec(compile(padded, page, "exec"), names)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("example", sorted((ROOT / "examples").glob("*.py")), ids=lambda path: path.stem)
+def test_examples_find_what_they_import(
+    example: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("sys.argv", [example.name, "--help"])
+    with pytest.raises(SystemExit) as end:
+        runpy.run_path(str(example), run_name="__main__")
+    assert not end.value.code
+    assert f"python examples/{example.name}" in capsys.readouterr().out
 
 
 @pytest.fixture
