@@ -16,7 +16,7 @@ from capture4d.app.drawing.render import Drawn, View, frame_view, heat_colours, 
 from capture4d.body.skinning import pose_frame, with_shape
 from capture4d.captures.capture import read_capture, read_scan
 from capture4d.captures.truth import read_truth_model, read_truth_vertices
-from capture4d.captures.work_folder import load_moving_body, load_registration
+from capture4d.captures.work_folder import open_work
 from capture4d.evaluation import truth_distances
 from capture4d.types import Mesh
 
@@ -40,7 +40,7 @@ def main() -> None:
     scan = read_scan(capture, options.frame)
     view = view_of(garment)
     paints = np.tile(np.array(CLOTH, np.uint8), (len(garment.vertices), 1))
-    for loop in load_registration(options.demo / "registration").garment.loops.values():
+    for loop in open_work(options.demo).registered.garment.loops.values():
         paints[loop] = PAINT
     truth = read_truth_model(capture)
     assert truth is not None
@@ -60,9 +60,10 @@ def main() -> None:
 
 def posed(work: Path, frame_id: int) -> tuple[Mesh, Mesh]:
     """The garment and the body of a frame."""
-    sequence = load_registration(work / "registration")
+    opened = open_work(work)
+    sequence = opened.registered
     row = sequence.frame_ids.tolist().index(frame_id)
-    body, poses = load_moving_body(work)
+    body, poses = opened.require_posed_body()
     of_body = pose_frame(with_shape(body, poses.shape), poses, poses.frame_ids.tolist().index(frame_id)).vertices()
     garment = sequence.garment.template.with_vertices(np.array(sequence.vertices[row]))
     return garment, body.template.with_vertices(of_body.astype(np.float32))

@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 
+from capture4d.cli.exit_codes import BAD_RESULT, GOOD
+
 __all__ = ["Doctor"]
 
 
@@ -29,4 +31,4 @@ class Doctor:
         print(json.dumps(as_json(diagnosis), indent=2) if self.json else as_text(diagnosis))
         for fault in diagnosis.faults:
             print(f"capture4d: {fault}", file=sys.stderr)
-        return 3 if diagnosis.faults else 0
+        return BAD_RESULT if diagnosis.faults else GOOD

@@ -5,7 +5,6 @@ import pkgutil
 import re
 import runpy
 import shlex
-import shutil
 from pathlib import Path
 
 import pytest
@@ -43,10 +42,10 @@ WITH_PYTHON = [page for page in PAGES if blocks(page, "python")]
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", WITH_PYTHON)
-def test_python_runs(page: str, shop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The snippets of a page run one after the other, in a folder with what they name."""
-    shutil.copytree(shop, tmp_path / "shop")
-    monkeypatch.chdir(tmp_path / "shop")
+def test_python_runs(page: str, shop: Path, monkeypatch: pytest.MonkeyPatch):
+    """The snippets of a page run one after the other, in a folder with what they name; what one page has made, another
+    finds done."""
+    monkeypatch.chdir(shop)
     names: dict[str, object] = {"__name__": "snippet"}
     for line, source in blocks(page, "python"):
         padded = "\n" * (line - 1) + source  # a traceback names the line of the page
