@@ -1,10 +1,13 @@
 """What README and docs tell a reader to type works: Python is run, command lines are parsed."""
 
 import importlib
+import json
 import pkgutil
 import re
 import runpy
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -111,6 +114,27 @@ def test_the_readme_is_one_page_and_its_snippet_at_most_15_lines():
     assert [len(source.splitlines()) <= 15 for _, source in blocks("README.md", "python")] == [True]
 
 
+@pytest.mark.slow
+def test_type_checkers_follow_the_snippet_of_the_readme(tmp_path: Path):
+    """Names that are loaded late keep their types."""
+    ((_, source),) = blocks("README.md", "python")
+    names = ("template", "registered.frame_ids", "fitted", "garment", "vertices")
+    (tmp_path / "snippet.py").write_text(source + "".join(f"reveal_type({name})\n" for name in names))
+    (tmp_path / "pyrightconfig.json").write_text(json.dumps({"extraPaths": [str(ROOT)]}))
+    command = [sys.executable, "-m", "pyright", "--pythonpath", sys.executable, "--project", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
+    assert 'Type of "template" is "Mesh"' in done.stdout
+    assert 'Type of "registered.frame_ids" is "ndarray[' in done.stdout
+    assert done.stdout.count("Type of ") == len(names)
+    assert not re.search(r'is "(Any|Unknown)"', done.stdout), done.stdout
+
+
 def test_the_table_of_commands_is_whole(capsys: pytest.CaptureFixture[str]):
     table = PAGES["docs/reference/commands.md"].read_text()
     assert sorted(re.findall(r"^\| `([a-z -]+)` \|", table, re.MULTILINE)) == sorted(names_of_commands(capsys))
+
+
+def test_the_reference_has_every_name_of_the_face():
+    listed = re.findall(r"^::: capture4d\.(\w+)$", PAGES["docs/reference/python.md"].read_text(), re.MULTILINE)
+    assert sorted(listed) == sorted({*capture4d.__all__} - {"__version__"})
