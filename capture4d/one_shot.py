@@ -7,7 +7,7 @@ as trimesh's; vertices of any float type, faces of any integer type, as arrays o
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,7 +18,10 @@ from registration.config import MeshRegistrationConfig
 from registration.register_mesh import MeshRegistration
 from registration.register_mesh import register_mesh as register_normalised
 
-__all__ = ["as_mesh", "load_registered", "register_mesh"]
+if TYPE_CHECKING:
+    from retarget.animation.garment_model import GarmentModel
+
+__all__ = ["as_mesh", "load_garment_model", "load_registered", "register_mesh"]
 
 
 def register_mesh(
@@ -59,6 +62,20 @@ def load_registered(work: WorkFolder | str | Path) -> RegisteredSequence:
     opened = work if isinstance(work, WorkFolder) else open_work(work)
     _ = opened.registered_digest
     return opened.registered
+
+
+def load_garment_model(path: str | Path, *, device: str = "cpu") -> "GarmentModel":
+    """What `fit` wrote, ready to be moved: `.vertices(poses, beta)` is the garment on a person in motion.
+
+    Args:
+        path: WORK, WORK/retarget, or the blendshapes.safetensors in it.
+        device: where torch computes.
+    Raises:
+        InputError: a file is missing, damaged, or belongs to another model.
+    """
+    from retarget.animation.garment_model import load_garment_model as load
+
+    return load(path, device=device)
 
 
 def as_mesh(value: Any, name: str = "mesh") -> Mesh:
