@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from capture4d.cli.main import main
 from capture4d.files.meshes import read_mesh, write_mesh
 from capture4d.files.records import load_garment, save_poses
+from tests.command_line import run
 
 # A garment that can be learned is what retarget's tests have.
 _SPEC = importlib.util.spec_from_file_location("retarget_world", Path(__file__).parents[1] / "retarget" / "conftest.py")
@@ -31,7 +31,5 @@ def shop(tube_capture_once: Path, write_work, motion, tmp_path_factory: pytest.T
     save_poses(folder / "motion.npz", motion(8, 5))
     take = write_work(folder.parent / "take", motion(16, 1))
     quick = ("--shape.max-error-mm", "0.1", "--lstm.layers", "1", "--lstm.size", "16", "--training.epochs", "3")
-    with pytest.raises(SystemExit) as end:
-        main(["fit", str(take), "--output", str(folder / "shirt"), "--workers", "1", *quick])
-    assert not end.value.code
+    assert run("fit", take, "--output", folder / "shirt", "--workers", "1", *quick) == 0
     return folder

@@ -14,7 +14,7 @@ import pytest
 from markdown_it import MarkdownIt
 
 import capture4d.cli
-from capture4d.cli.main import main
+from tests.command_line import run
 
 ROOT = Path(__file__).parents[3]
 PAGES = {str(path.relative_to(ROOT)): path for path in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))}
@@ -76,27 +76,21 @@ def parse_only(monkeypatch: pytest.MonkeyPatch) -> None:
                 monkeypatch.setattr(value, "__call__", lambda _: 0)
 
 
-def run(words: list[str]) -> int:
-    with pytest.raises(SystemExit) as end:
-        main(words)
-    return int(end.value.code or 0)
-
-
 def names_of_commands(capsys: pytest.CaptureFixture[str]) -> list[str]:
-    run(["--help"])
+    run("--help")
     return re.findall(r"^  ([a-z-]+(?: [a-z]+)?)  ", capsys.readouterr().out, re.MULTILINE)
 
 
 @pytest.mark.parametrize("words", LINES)
 def test_a_command_line_is_understood(words: list[str], parse_only: None, capsys: pytest.CaptureFixture[str]):
     """The command exists and takes these options and values; it is not run."""
-    assert run(words) == 0, capsys.readouterr().err
+    assert run(*words) == 0, capsys.readouterr().err
 
 
 def test_a_wrong_line_is_found(parse_only: None):
-    assert run(["register", "capture", "--output", "work", "--no-such-option", "3"]) == 2
-    assert run(["synth", "take", "--preset", "no-such-preset"]) == 2
-    assert run(["no-such-command"]) == 2
+    assert run("register", "capture", "--output", "work", "--no-such-option", "3") == 2
+    assert run("synth", "take", "--preset", "no-such-preset") == 2
+    assert run("no-such-command") == 2
 
 
 def test_command_lines_are_said_to_be_some():

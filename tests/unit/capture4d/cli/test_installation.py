@@ -9,13 +9,11 @@ import pytest
 
 from capture4d.cli import installation
 from capture4d.cli.installation import Part, diagnose, load_apart
-from capture4d.cli.main import main
+from tests.command_line import run as command
 
 
 def run(*arguments: str) -> int:
-    with pytest.raises(SystemExit) as exit_:
-        main(["doctor", *arguments])
-    return int(exit_.value.code or 0)
+    return command("doctor", *arguments)
 
 
 @pytest.fixture(autouse=True)
