@@ -52,9 +52,8 @@ def _asks_for_neighbour(origin: Path) -> bool:
     folder = (origin.parents[1] if origin.name == "__init__.py" else origin.parent).resolve()
     if folder == _ROOT:
         return False
-    frame = sys._getframe(1)
-    while frame is not None and (
-        frame.f_code.co_filename.startswith("<frozen") or frame.f_code.co_filename == __file__
-    ):
+    # inspect has a public name for it, and would cost every command its import
+    frame = sys._getframe(1)  # pyright: ignore[reportPrivateUsage]
+    while frame is not None and frame.f_code.co_filename.startswith(("<frozen", __file__)):
         frame = frame.f_back
     return frame is not None and Path(frame.f_code.co_filename).resolve().parent == folder

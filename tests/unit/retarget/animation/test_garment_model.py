@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from retarget.animation.intersections import BodySurface
 
 from capture4d.body.skinning import pose_frame
 from capture4d.captures.work_folder import load_registration, open_work
 from capture4d.errors import InputError
 from capture4d.files.records import save_poses
+from capture4d.geometry.intersection_removal import ClosedSurface
 from capture4d.types import PoseSequence
 from retarget.animation.garment_model import GarmentModel, load_garment_model
 from retarget.animation.stage import Wearer, run
@@ -58,7 +58,7 @@ def test_somebody_else_wears_it_outside_the_body(garment_model: GarmentModel, po
     def inside(vertices: np.ndarray) -> int:
         count = 0
         for row, placed in enumerate(vertices):
-            surface = BodySurface(pose_frame(person, poses, row).vertices(), person.body.template.faces)
+            surface = ClosedSurface(pose_frame(person, poses, row).vertices(), person.body.template.faces)
             count += int((surface.heights(placed)[0] < -1e-4).sum())
         return count
 
