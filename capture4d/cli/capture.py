@@ -96,13 +96,15 @@ class Calibrate:
     """Processes to use; the result does not depend on it."""
     colmap: Path | None = None
     """Folder for the rig as a COLMAP model as well."""
+    overwrite: bool = False
+    """Calibrate anew, also over a rig of other settings; corners that are known stay known."""
     config: Annotated[CalibrationConfig, arg(name="")] = field(default_factory=CalibrationConfig)
 
     def __call__(self) -> int:
         from capture4d.app.report.calibration import print_calibration, write_page
         from capture4d.calibration.stage import run
 
-        report = run(
+        result = run(
             self.images,
             self.output,
             self.board,
@@ -110,10 +112,11 @@ class Calibrate:
             pattern=self.pattern,
             colmap=self.colmap,
             workers=self.workers,
+            overwrite=self.overwrite,
         )
-        print_calibration(report)
-        page = write_page(self.output.with_name("calibration.html"), report)
-        print(f"rig: {self.output}, report: {page}")
+        print_calibration(result.report)
+        page = write_page(self.output.with_name("calibration.html"), result.report)
+        print(f"rig: {result.path}, report: {page}")
         return GOOD
 
 

@@ -333,10 +333,13 @@ def test_a_sound_take_is_clean(sound: dict[int, Scan], tmp_path: Path, capsys: p
     assert all(0 <= score <= 1 for score in found["scores"].values())
 
 
-def test_warnings_are_exit_code_1(sound: dict[int, Scan], tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_warnings_are_a_bad_result_for_the_strict_alone(
+    sound: dict[int, Scan], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     take = write(tmp_path / "take", {number: scan for number, scan in sound.items() if number != 12})
     code, found = check(capsys, take)
-    assert (code, codes(found), found["findings"][0]["frames"]) == (1, ["frames-missing"], [12])
+    assert (code, codes(found), found["findings"][0]["frames"]) == (0, ["frames-missing"], [12])
+    assert check(capsys, take, "--strict")[0] == 3
 
 
 TURN = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
@@ -367,7 +370,7 @@ def test_a_fixed_take_is_clean_and_the_original_untouched(
     before = digest()
     code, found = check(capsys, take, "--fix")
     assert codes(found) == [wrong]
-    assert code == (1 if wrong == "floor" else 2)
+    assert code == (0 if wrong == "floor" else 3)
     assert found["fixed"] == str(tmp_path / "take-fixed")
     assert digest() == before
     assert check(capsys, tmp_path / "take-fixed")[1]["findings"] == []
