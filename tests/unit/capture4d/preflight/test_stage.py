@@ -463,7 +463,7 @@ def test_unusable_frames_are_left_out(sound: dict[int, Scan], tmp_path: Path, ca
     (take / "scans" / "000011.ply").write_bytes(whole[: len(whole) // 2])
     (take / "scans" / "000013.ply").write_bytes(b"")
     code, found = check(capsys, take, "--fix")
-    assert (code, codes(found)) == (2, ["frame-unreadable", "frame-empty"])
+    assert (code, codes(found)) == (3, ["frame-unreadable", "frame-empty"])
     description = json.loads((tmp_path / "take-fixed" / "capture.json").read_text())
     assert description["frames"] == [10, 12, 14]
     assert description["dropped_frames"] == [11, 13]
