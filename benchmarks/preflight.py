@@ -24,9 +24,9 @@ from benchmarks.metric import Metric
 from benchmarks.plain_takes import COARSE_SCANNER, PlainTake, PlainTakeConfig, plain_take
 from capture4d.body.anny import load_anny
 from capture4d.files.meshes import write_mesh
+from capture4d.preflight.check import check_take
+from capture4d.preflight.findings import Code
 from capture4d.preflight.fix import write_fixed
-from capture4d.preflight.stage import check_take
-from capture4d.preflight.verdict import Code
 from data_synth.config import MotionConfig
 from data_synth.scanner.config import RigConfig
 
@@ -322,7 +322,7 @@ PEAK_SCRIPT = """
 import sys
 from pathlib import Path
 from benchmarks.memory import peak_rss_mb
-from capture4d.preflight.stage import check_take
+from capture4d.preflight.check import check_take
 check_take(Path(sys.argv[1]), all_frames=True)
 print(peak_rss_mb())
 """

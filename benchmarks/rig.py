@@ -251,7 +251,7 @@ def _rendered(board: Board, size: _Size) -> list[Metric]:
     with tempfile.TemporaryDirectory(prefix="capture4d-rig-") as scratch:
         folder = Path(scratch)
         _photograph(folder / "images", truth, board, poses, rng)
-        report = calibrate(folder / "images", folder / "rig.json", SPEC, colmap=folder / "colmap")
+        report = calibrate(folder / "images", folder / "rig.json", SPEC, colmap=folder / "colmap").report
         rig = load_rig(folder / "rig.json")
         exchanged = np.abs(read_model(folder / "colmap").T_camera_world - rig.T_camera_world).max()
         errors = _rig_errors(RigEstimate(rig, poses, board.corners), truth)

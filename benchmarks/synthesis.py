@@ -31,7 +31,7 @@ from data_synth.cloth.wrinkle_relaxation import lift, relax_frame
 from data_synth.config import FABRICS, PRESETS, SynthConfig
 from data_synth.scanner.scan import LABEL_BODY, scan_surfaces
 from data_synth.stage import run as synthesise
-from data_synth.take import Take, prepare_take, simulate_take, take_rig, take_surfaces
+from data_synth.take import TakePlan, plan_take, simulate_take, take_rig, take_surfaces
 
 OVERHEAD_COSINE = 0.5
 """An upper arm that points up steeper than this is overhead."""
@@ -116,7 +116,7 @@ def run(*, quick: bool = False, frames: int = 120, workers: int = 2) -> list[Met
 
 
 def _measure(job: _Job) -> tuple[SynthConfig, dict[str, float]]:
-    take = prepare_take(job.config)
+    take = plan_take(job.config)
     faces = take.shaped.body.template.faces
     started = time.process_time()
     clip = [(index, coarse, fine) for index, coarse, fine in simulate_take(take) if fine is not None]
@@ -159,7 +159,7 @@ def _angles(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.degrees(np.arccos(np.clip(np.einsum("vc,vc->v", first, second), -1, 1)))
 
 
-def _wrinkles(take: Take, clip: list) -> tuple[np.ndarray, np.ndarray, dict[int, np.ndarray]]:
+def _wrinkles(take: TakePlan, clip: list) -> tuple[np.ndarray, np.ndarray, dict[int, np.ndarray]]:
     """Per frame: what a template at the truth cannot show, deg; and how fine and coarse normals change, deg."""
     to_fine, fine_weights = locate(take.fine, take.template.vertex_uv)
     to_template, template_weights = locate(take.template, take.fine.vertex_uv)
@@ -179,7 +179,7 @@ def _wrinkles(take: Take, clip: list) -> tuple[np.ndarray, np.ndarray, dict[int,
     return np.array(residuals), np.array(changes), normals
 
 
-def _arms_overhead(take: Take, index: int) -> bool:
+def _arms_overhead(take: TakePlan, index: int) -> bool:
     body = take.bodies[take.lead + index]
     names, joints = take.shaped.body.joint_names, take.shaped.joints
     up = []
@@ -193,9 +193,9 @@ def _arms_overhead(take: Take, index: int) -> bool:
 def _determinism(job: _Job, normals: dict[int, np.ndarray]) -> float:
     """Mean angle, deg, to a second simulation, dressed anew, that joins the clip a third of the way in."""
     assert job.late_start is not None
-    take = prepare_take(job.config)
+    take = plan_take(job.config)
     first = job.late_start * job.config.capture_every
-    later = prepare_take(
+    later = plan_take(
         replace(
             job.config,
             frames=job.config.frames - job.late_start,
@@ -210,7 +210,7 @@ def _determinism(job: _Job, normals: dict[int, np.ndarray]) -> float:
     return float(np.mean(compared))
 
 
-def _fold_determinism(job: _Job, take: Take, clip: list, normals: dict[int, np.ndarray]) -> float:
+def _fold_determinism(job: _Job, take: TakePlan, clip: list, normals: dict[int, np.ndarray]) -> float:
     """Mean angle, deg, to folds on the same coarse cloth that start anew a third of the way into the clip."""
     assert job.late_start is not None
     fabric, offsets, compared = FABRICS[take.config.fabric], None, []
@@ -224,7 +224,7 @@ def _fold_determinism(job: _Job, take: Take, clip: list, normals: dict[int, np.n
     return float(np.mean(compared))
 
 
-def _hem_sag(take: Take, clip: list, frames: int) -> float:
+def _hem_sag(take: TakePlan, clip: list, frames: int) -> float:
     """How much lower the hem hangs than in the same cloth solved with four times the iterations, mm, largest frame.
 
     Only the first `frames` simulated frames of the clip are compared: 0 to 39 in the whole benchmark, while the arms go
@@ -244,7 +244,7 @@ def _hem_sag(take: Take, clip: list, frames: int) -> float:
     return 1e3 * float(np.abs(sags).max())
 
 
-def _scans(take: Take, clip: list) -> dict[str, float]:
+def _scans(take: TakePlan, clip: list) -> dict[str, float]:
     extent = np.array([(fine.min(axis=0), fine.max(axis=0)) for _, _, fine in clip])
     rig = take_rig(take.config, extent)
     vertices, accuracy, angles, holes, cpu = [], [], [], [], 0.0

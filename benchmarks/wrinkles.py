@@ -135,72 +135,131 @@ def run(
         cell_steps: steps of the cells of the table and of the variants, all alike.
         keep: folder for the trained networks; those that are there are not trained again.
     """
-    bases, validation_share = BASES, SplitConfig().validation_share
-    if quick:
-        clips, base, seeds, cell_steps = _quick_clips(workers), QUICK, 1, 60
-        bases, validation_share = {"bs500": 6, "bs200": 3}, 0.0  # most of its few frames are flagged
-    elif not (train or like or unlike):
-        clips, base = _training_clips(workers), PRESETS["small"]
+    plan = _quick_plan(workers) if quick else _plan(train, like, unlike, seeds, cell_steps, workers)
+    for work in plan.clips.all:
+        if train:
+            ensure_pairs(work, plan.clips.pairs, workers=workers)
+        else:
+            renew(partial(make_pairs, work, plan.clips.pairs, workers=workers))
+    with tempfile.TemporaryDirectory() as scratch:
+        measured = _measure(plan, keep or Path(scratch), workers)
+    for kind, found in measured.flickers.items():
+        Console().print(f"flicker, {kind}: {' '.join(f'{value:.4f}' for value in found)} deg")
+    cells, inputs = measured.cells, measured.inputs
+    _print_cells(cells, PRINTED)
+    _print_cells({"registration": cells["printed"], **inputs}, {"registration": PRINTED["printed"], **PRINTED_INPUTS})
+    return [
+        *_metrics(plan, measured),
+        Metric("ms_per_map_paper", _milliseconds(PRESETS["paper"], 3 if quick else 15, workers), "ms"),
+        Metric("ms_per_map", _milliseconds(PRESETS["small"], 5 if quick else 50, workers), "ms"),
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class _Plan:
+    """What is trained on what."""
+
+    clips: _Clips
+    base: WrinkleConfig
+    seeds: int
+    cell_steps: int
+    bases: Mapping[str, int]
+    """Blendshapes of each kind of input."""
+    validation_share: float
+
+
+def _quick_plan(workers: int) -> _Plan:
+    """Without a validation share: most of its few frames are flagged."""
+    return _Plan(_quick_clips(workers), replace(QUICK, held_out=0.0), 1, 60, {"bs500": 6, "bs200": 3}, 0.0)
+
+
+def _plan(
+    train: tuple[Path, ...],
+    like: tuple[Path, ...],
+    unlike: tuple[Path, ...],
+    seeds: int,
+    cell_steps: int,
+    workers: int,
+) -> _Plan:
+    if not (train or like or unlike):
+        clips = _training_clips(workers)
     elif not (train and like and unlike):
         raise InputError("benchmarks wrinkles: expected --train, --like and --unlike together, or none of them")
     else:
-        clips, base = _Clips(train, like, unlike, PairConfig()), PRESETS["small"]
+        clips = _Clips(train, like, unlike, PairConfig())
         if len({work.name for work in clips.all}) < len(clips.all):
             raise InputError("benchmarks wrinkles: expected work folders of different names, found two alike")
-    base = replace(base, held_out=0.0)
-    for work in clips.all:
-        if train:
-            ensure_pairs(work, clips.pairs, workers=workers)
-        else:
-            renew(partial(make_pairs, work, clips.pairs, workers=workers))
+    base = replace(PRESETS["small"], held_out=0.0)
+    return _Plan(clips, base, seeds, cell_steps, BASES, SplitConfig().validation_share)
+
+
+@dataclass(frozen=True, slots=True)
+class _Measured:
+    """What the trained networks make."""
+
+    results: list[_Result]
+    """Of each seed, on the held-out clips of like motions."""
+    unlike_ratios: list[float]
+    """Of each seed, on those of unlike motions."""
+    evidence: list[dict[str, float]]
+    only_l1: _Result
+    cells: dict[str, _Result]
+    flickers: dict[str, list[float]]
+    """Of each seed, degrees, with and without a temporal term."""
+    inputs: dict[str, _Result]
+
+
+def _measure(plan: _Plan, folder: Path, workers: int) -> _Measured:
+    """Train every network that is not in the folder yet, and score them all."""
+    clips, base = plan.clips, plan.base
     results, unlike_ratios, evidence = [], [], []
-    with tempfile.TemporaryDirectory() as scratch:
-        folder = keep or Path(scratch)
-        for seed in range(seeds):
-            model = _trained(clips, replace(base, seed=seed), folder / f"seed{seed}", workers)
-            results.append(_scored(model, clips.like))
-            unlike_ratios.append(_scored(model, clips.unlike).ratio)
-            evidence.append(_norm_evidence(model, clips.like))
-        shorter = replace(base, schedule=replace(base.schedule, steps=cell_steps))
+    for seed in range(plan.seeds):
+        model = _trained(clips, replace(base, seed=seed), folder / f"seed{seed}", workers)
+        results.append(_scored(model, clips.like))
+        unlike_ratios.append(_scored(model, clips.unlike).ratio)
+        evidence.append(_norm_evidence(model, clips.like))
+    shorter = replace(base, schedule=replace(base.schedule, steps=plan.cell_steps))
 
-        def cell(name: str, shown: _Clips, loss: LossConfig, seed: int = 0) -> _Result:
-            config = replace(shorter, loss=loss, seed=seed)
-            return _scored(_trained(shown, config, folder / name, workers), shown.like)
+    def cell(name: str, shown: _Clips, loss: LossConfig, seed: int = 0) -> _Result:
+        config = replace(shorter, loss=loss, seed=seed)
+        return _scored(_trained(shown, config, folder / name, workers), shown.like)
 
-        only_l1 = cell("l1-only", clips, LossConfig(gan=0.0, temporal=0.0))
-        cells = {kind: cell(kind, clips, LossConfig(temporal_kind=kind)) for kind in get_args(TemporalLoss)}
-        flickers = {
-            kind: [cells[kind].made.flicker_deg]
-            + [
-                cell(f"{kind}-seed{seed}", clips, LossConfig(temporal_kind=kind), seed).made.flicker_deg
-                for seed in range(1, seeds)
-            ]
-            for kind in (base.loss.temporal_kind, "none")
-        }
-        answers = _answers(clips, folder, bases, validation_share, workers)
-        inputs = {name: cell(name, shown, LossConfig(temporal_kind="printed")) for name, shown in answers.items()}
-    for kind, found in flickers.items():
-        Console().print(f"flicker, {kind}: {' '.join(f'{value:.4f}' for value in found)} deg")
-    _print_cells({**cells}, PRINTED)
-    _print_cells({"registration": cells["printed"], **inputs}, {"registration": PRINTED["printed"], **PRINTED_INPUTS})
-    made = [result.made for result in results]
+    only_l1 = cell("l1-only", clips, LossConfig(gan=0.0, temporal=0.0))
+    kinds: tuple[TemporalLoss, ...] = get_args(TemporalLoss)
+    cells: dict[str, _Result] = {kind: cell(kind, clips, LossConfig(temporal_kind=kind)) for kind in kinds}
+    compared: tuple[TemporalLoss, ...] = (base.loss.temporal_kind, "none")
+    flickers = {
+        kind: [cells[kind].made.flicker_deg]
+        + [
+            cell(f"{kind}-seed{seed}", clips, LossConfig(temporal_kind=kind), seed).made.flicker_deg
+            for seed in range(1, plan.seeds)
+        ]
+        for kind in compared
+    }
+    answers = _answers(clips, folder, plan.bases, plan.validation_share, workers)
+    inputs = {name: cell(name, shown, LossConfig(temporal_kind="printed")) for name, shown in answers.items()}
+    return _Measured(results, unlike_ratios, evidence, only_l1, cells, flickers, inputs)
+
+
+def _metrics(plan: _Plan, measured: _Measured) -> list[Metric]:
+    ratios = [result.ratio for result in measured.results]
+    made = [result.made for result in measured.results]
+    flickers = measured.flickers
     return [
-        Metric("normal_error_ratio", float(np.mean([result.ratio for result in results]))),
-        Metric("normal_error_ratio_worst_seed", max(result.ratio for result in results)),
-        Metric("normal_error_ratio_unlike", float(np.mean(unlike_ratios))),
+        Metric("normal_error_ratio", float(np.mean(ratios))),
+        Metric("normal_error_ratio_worst_seed", max(ratios)),
+        Metric("normal_error_ratio_unlike", float(np.mean(measured.unlike_ratios))),
         Metric("normal_error_deg", float(np.mean([each.normal_error_deg for each in made])), "deg"),
         Metric("wrinkle_energy_kept", float(np.mean([each.wrinkle_energy_kept for each in made])), "", "higher"),
-        Metric("wrinkle_energy_kept_l1_only", only_l1.made.wrinkle_energy_kept, "", "higher"),
-        Metric("flicker", float(np.mean(flickers[base.loss.temporal_kind])), "deg"),
+        Metric("wrinkle_energy_kept_l1_only", measured.only_l1.made.wrinkle_energy_kept, "", "higher"),
+        Metric("flicker", float(np.mean(flickers[plan.base.loss.temporal_kind])), "deg"),
         Metric("flicker_no_temporal", float(np.mean(flickers["none"])), "deg", "higher"),
         Metric("ssim", float(np.mean([each.ssim for each in made])), "", "higher"),
-        *_cell_metrics({**cells, **inputs}),
+        *_cell_metrics({**measured.cells, **measured.inputs}),
         *(
-            Metric(f"normal_error_{kind}_norm_deg", float(np.mean([each[kind] for each in evidence])), "deg")
+            Metric(f"normal_error_{kind}_norm_deg", float(np.mean([each[kind] for each in measured.evidence])), "deg")
             for kind in ("running", "instance")
         ),
-        Metric("ms_per_map_paper", _milliseconds(PRESETS["paper"], 3 if quick else 15, workers), "ms"),
-        Metric("ms_per_map", _milliseconds(PRESETS["small"], 5 if quick else 50, workers), "ms"),
     ]
 
 

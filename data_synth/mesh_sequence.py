@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,6 +27,10 @@ class MeshSequence:
     """Mesh file of each frame number; all the same npz if the sequence is one."""
     arrays: tuple[np.ndarray, np.ndarray] | None = None
     """Vertices (T, V, 3) and faces (F, 3) of an npz: read once, for it has to be unpacked whole."""
+
+    def __reduce__(self) -> tuple[Callable[[Path], MeshSequence], tuple[Path]]:
+        """Travels to another process as its path: what an npz holds may be too much to send."""
+        return open_sequence, (self.path,)
 
     @property
     def frame_ids(self) -> tuple[int, ...]:

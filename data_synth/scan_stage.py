@@ -7,7 +7,7 @@ template vertex. Sequences whose faces change are scanned too, without truth.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +26,7 @@ from capture4d.geometry.mesh import boundary_loops
 from capture4d.heavy_imports import import_open3d
 from capture4d.runs.stage import Stage, StageResult, open_stage
 from capture4d.runs.workers import run_jobs
-from capture4d.types import Garment, Mesh
+from capture4d.types import Garment, Mesh, Rig
 from data_synth.mesh_sequence import MeshSequence, open_sequence
 from data_synth.scan_files import pending_scans
 from data_synth.scanner.border_paint import PaintedSheet, paint_borders
@@ -66,10 +66,8 @@ def run(
     """
     colours = [parse_colour(text) for text in config.border_colours]
     garment_colour = parse_colour(config.garment_colour)
-    for cached in (_sequence, _first, _painted):  # files may have changed since an earlier run in this process
-        cached.cache_clear()
     source = _open_source(meshes, config)
-    upstream = {"meshes": _sequence(meshes).digest()}
+    upstream = {"meshes": source.sequence.digest()}
     if template is not None:
         upstream["template"] = file_digest([template], root=template.parent)
     stage = open_stage(output, name="scan", schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite)
@@ -77,8 +75,8 @@ def run(
     pending = set(pending_scans(stage, source.frame_ids))
     if same_topology:
         pending.update(stage.pending(source.frame_ids, folder="truth"))
-    jobs = sorted(pending)
-    for _ in run_jobs(partial(_scan_frame, stage, source, same_topology), jobs, workers=workers, label="scan"):
+    prepare = partial(_open_scene, stage, source, same_topology)
+    for _ in run_jobs(_scan_frame, sorted(pending), prepare=prepare, workers=workers, label="scan"):
         pass
     garment = source.loop_names if colours and config.border_paint_m > 0 else ()
     write_capture_description(
@@ -99,58 +97,49 @@ def run(
     return stage.finish(files)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Source:
-    """A sequence in metres and with Y up. Cheap to send to a worker, which reads the meshes it needs itself."""
+    """A sequence in metres and with Y up."""
 
-    path: Path
+    sequence: MeshSequence
     config: ScanConfig
+    frame_ids: tuple[int, ...]
+    """The chosen ones."""
     scale: float
-
-    @property
-    def frame_ids(self) -> tuple[int, ...]:
-        return _chosen_frames(_sequence(self.path), self.config)
+    first: Mesh
+    """Of the chosen ones."""
 
     @property
     def loop_names(self) -> tuple[str, ...]:
-        return tuple(f"border_{index}" for index in range(len(boundary_loops(_first(self).faces))))
+        return tuple(f"border_{index}" for index in range(len(boundary_loops(self.first.faces))))
 
     def mesh(self, frame_id: int) -> Mesh:
-        return self.upright(_sequence(self.path).read(frame_id))
+        return self.upright(self.sequence.read(frame_id))
 
     def upright(self, mesh: Mesh) -> Mesh:
         """A mesh of the sequence's files, or the template's, in metres and with Y up."""
-        rotation = np.array(ROTATIONS[self.config.up], float)
-        return mesh.with_vertices((self.scale * mesh.vertices.astype(float) @ rotation.T).astype(np.float32))
-
-
-_sequence = cache(open_sequence)
-
-
-@cache
-def _first(source: _Source) -> Mesh:
-    return source.mesh(source.frame_ids[0])
+        return _upright(mesh, self.scale, self.config)
 
 
 def _open_source(path: Path, config: ScanConfig) -> _Source:
-    scale = 1.0
-    if config.height_m is not None:
-        sequence = _sequence(path)
-        first = sequence.read(_chosen_frames(sequence, config)[0]).vertices
-        scale = config.height_m / float(np.ptp(first[:, "xyz".index(config.up)]))
-    return _Source(path, config, scale)
-
-
-def _chosen_frames(sequence: MeshSequence, config: ScanConfig) -> tuple[int, ...]:
+    sequence = open_sequence(path)
     chosen = sequence.frame_ids[config.first_frame :: config.step][: config.frames]
     if not chosen:
-        raise InputError(f"{sequence.path}: no frame left from number {config.first_frame} on")
-    return chosen
+        raise InputError(f"no frame left from number {config.first_frame} on", where=path)
+    first, scale = sequence.read(chosen[0]), 1.0
+    if config.height_m is not None:
+        scale = config.height_m / float(np.ptp(first.vertices[:, "xyz".index(config.up)]))
+    return _Source(sequence, config, chosen, scale, _upright(first, scale, config))
+
+
+def _upright(mesh: Mesh, scale: float, config: ScanConfig) -> Mesh:
+    rotation = np.array(ROTATIONS[config.up], float)
+    return mesh.with_vertices((scale * mesh.vertices.astype(float) @ rotation.T).astype(np.float32))
 
 
 def _prepare(stage: Stage, source: _Source, template: Path | None) -> bool:
     """Write rig, template and truth model where missing; whether all meshes have the same faces."""
-    first = _first(source)
+    first = source.first
     model, rig, own = stage.path / MODEL, stage.path / "rig.json", stage.path / "template.npz"
     lost = not model.is_file() and model.parent.is_dir()
     if lost or not rig.is_file() or not own.is_file():
@@ -181,15 +170,17 @@ def _template(source: _Source, first: Mesh, path: Path | None) -> tuple[Garment,
         return Garment(mesh, dict(zip(names, boundary_loops(first.faces), strict=True))), *_own_vertices(first)
     if boundary_loops(mesh.faces) and not names:
         raise InputError(
-            f"{path}: expected a closed template, as the first mesh of {source.path} is; found one with open borders"
+            f"expected a closed template, as the first mesh of {source.sequence.path} is; found one with open borders",
+            where=path,
         )
     points, faces, barycentric = closest_points(first, mesh.vertices)
     distance = np.linalg.norm(points - mesh.vertices, axis=1).mean()
     size = np.ptp(first.vertices, axis=0).max()
     if distance > 0.01 * size:
         raise InputError(
-            f"{path}: expected a template that lies on the first mesh of {source.path}, or has its faces, "
-            f"found one that is {distance / size:.0%} of its size away"
+            f"expected a template that lies on the first mesh of {source.sequence.path}, or has its faces, "
+            f"found one that is {distance / size:.0%} of its size away",
+            where=path,
         )
     return Garment(mesh, _matched_loops(mesh, first, names)), faces, barycentric
 
@@ -231,11 +222,6 @@ def _decimated(mesh: Mesh, vertices: int) -> Mesh:
     return Mesh(np.asarray(simple.vertices, np.float32), np.asarray(simple.triangles, np.int32))
 
 
-@cache
-def _painted(source: _Source) -> PaintedSheet:
-    return paint_like(_first(source), _first(source), source.config)
-
-
 def paint_like(mesh: Mesh, first: Mesh, config: ScanConfig) -> PaintedSheet:
     """Paint each border as the one of the first mesh that it is: which is the longest may change with the faces."""
     colours = [parse_colour(text) for text in config.border_colours]
@@ -261,23 +247,39 @@ def _same_loops(mesh: Mesh, first: Mesh) -> list[int]:
     return found.tolist()
 
 
-def _scan_frame(stage: Stage, source: _Source, same_topology: bool, frame_id: int) -> None:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Scene:
+    """What all frames are scanned with."""
+
+    stage: Stage
+    source: _Source
+    rig: Rig
+    sheet: PaintedSheet | None
+    """The painted cloth of every frame, if all have the same faces."""
+
+
+def _open_scene(stage: Stage, source: _Source, same_topology: bool) -> _Scene:
+    sheet = paint_like(source.first, source.first, source.config) if same_topology else None
+    return _Scene(stage, source, load_rig(stage.path / "rig.json"), sheet)
+
+
+def _scan_frame(scene: _Scene, frame_id: int) -> None:
     """Scan one mesh; truth first, for the frame counts as done once its scan is there."""
-    config = source.config
+    stage, source, config = scene.stage, scene.source, scene.source.config
     mesh = source.mesh(frame_id)
-    sheet = _painted(source) if same_topology else paint_like(mesh, _first(source), config)
+    sheet = scene.sheet or paint_like(mesh, source.first, config)
     surface = Surface(
         sheet.posed(mesh.vertices), sheet.colours, LABEL_GARMENT, config.scanner.fusion.garment_voxel_m, sheet.painted
     )
     scan, labels = scan_surfaces(
-        load_rig(stage.path / "rig.json"),
+        scene.rig,
         [surface],
         config=config.scanner,
         rng=np.random.default_rng([config.seed, frame_id]),
         frame_id=frame_id,
         time_s=frame_id / config.fps,
     )
-    if same_topology:
+    if scene.sheet is not None:
         none = np.zeros((0, 3, 3), np.float32), np.zeros(3, np.float32)
         write_truth_frame(stage.frame_path(frame_id, folder="truth"), TruthFrame(mesh.vertices, *none, labels))
     write_scan(stage.frame_path(frame_id, ".ply", folder="scans"), scan)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -24,11 +25,14 @@ from data_synth.config import SynthConfig
 from data_synth.outfits import OUTFITS
 from data_synth.scan_files import pending_scans
 from data_synth.scanner.scan import scan_surfaces
-from data_synth.take import Take, measured_poses, prepare_take, simulate_take, take_rig, take_surfaces
+from data_synth.take import TakePlan, measured_poses, plan_take, simulate_take, take_rig, take_surfaces
 
 __all__ = [
+    "ScanJob",
+    "Scene",
     "finish_take",
     "is_whole",
+    "open_scene",
     "open_take",
     "run",
     "scan_frame",
@@ -71,7 +75,8 @@ def run(output: Path, config: SynthConfig, *, workers: int = 2, overwrite: bool 
         finished=lambda: simulated_frames(stage),
     ):
         pass
-    for _ in run_jobs(scan_frame, scan_jobs(stage, config), workers=workers, label="Scanning"):
+    prepare = partial(open_scene, stage, config)
+    for _ in run_jobs(scan_frame, scan_jobs(stage, config), prepare=prepare, workers=workers, label="Scanning"):
         pass
     return finish_take(stage, config)
 
@@ -157,7 +162,7 @@ def finish_take(stage: Stage, config: SynthConfig) -> StageResult:
 
 def simulate_clip(job: SimulationJob) -> None:
     """Simulate a clip and write its cloth, and what no scan changes."""
-    take, folder, config = prepare_take(job.config), job.stage.path, job.config
+    take, folder, config = plan_take(job.config), job.stage.path, job.config
     faces = take.shaped.body.template.faces
     dressed, extent = None, []
     for index, coarse, fine in simulate_take(take):
@@ -195,7 +200,7 @@ def simulate_clip(job: SimulationJob) -> None:
     write_json(folder / "cloth" / "complete.json", {"frames": config.frames})
 
 
-def _write_model(take: Take, folder: Path, dressed: np.ndarray, coarse: np.ndarray, fine: np.ndarray) -> None:
+def _write_model(take: TakePlan, folder: Path, dressed: np.ndarray, coarse: np.ndarray, fine: np.ndarray) -> None:
     """The template, and the truth that no frame changes."""
     body_at = take.config.simulation.calm_frames - 1
     settled = carry(take.coarse, take.template, coarse)
@@ -213,23 +218,28 @@ def _write_model(take: Take, folder: Path, dressed: np.ndarray, coarse: np.ndarr
     )
 
 
-_PREPARED: dict[SynthConfig, tuple[Take, Rig]] = {}
-"""What a scanning process prepares once; a process serves one take."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """What all frames of a take are scanned with."""
+
+    plan: TakePlan
+    rig: Rig
 
 
-def scan_frame(job: ScanJob) -> int:
+def open_scene(stage: Stage, config: SynthConfig) -> Scene:
+    """The scene of a take that has been simulated."""
+    return Scene(plan_take(config), load_rig(stage.path / "rig.json"))
+
+
+def scan_frame(scene: Scene, job: ScanJob) -> int:
     """Scan a simulated frame and write its truth; its number."""
-    if job.config not in _PREPARED:
-        _PREPARED.clear()
-        _PREPARED[job.config] = prepare_take(job.config), load_rig(job.stage.path / "rig.json")
-    take, rig = _PREPARED[job.config]
-    folder, frame_id, config = job.stage.path, job.frame_id, job.config
+    take, folder, frame_id, config = scene.plan, job.stage.path, job.frame_id, job.config
     with np.load(folder / "cloth" / f"{frame_id:06d}.npz", allow_pickle=False) as cloth:
         fine, surface = cloth["vertices"], cloth["body"]
     labels = np.zeros(0, np.uint8)
     if config.scans:
         scan, labels = scan_surfaces(
-            rig,
+            scene.rig,
             take_surfaces(take, fine, surface),
             config=config.scanner,
             rng=np.random.default_rng([config.seed, 200, frame_id]),

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
+from jaxtyping import Bool, UInt8
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
@@ -26,11 +26,12 @@ from data_synth.scanner.rig import bounding_sphere, scanner_rig
 from data_synth.scanner.scan import LABEL_BODY, LABEL_GARMENT, Surface
 
 __all__ = [
-    "Take",
+    "Paint",
+    "TakePlan",
     "dress_colours",
     "measured_poses",
     "painted_band",
-    "prepare_take",
+    "plan_take",
     "simulate_take",
     "take_rig",
     "take_surfaces",
@@ -43,8 +44,19 @@ RIG_RADIUS_M = 0.58
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Take:
-    """All that is known before anything is simulated."""
+class Paint:
+    """Colours of garment and body, the same in every frame of a take."""
+
+    garment: UInt8[np.ndarray, "verts 3"]
+    """sRGB per vertex of the fine cloth."""
+    is_border: Bool[np.ndarray, " verts"]
+    """Where the fine cloth is painted."""
+    body: UInt8[np.ndarray, "body_verts 3"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TakePlan:
+    """All that is known of a take before anything is simulated."""
 
     config: SynthConfig
     shaped: ShapedBody
@@ -57,6 +69,7 @@ class Take:
     fine: PanelMesh
     template: PanelMesh
     wrinkles: WrinkleMesh
+    paint: Paint
 
     @property
     def lead(self) -> int:
@@ -65,7 +78,7 @@ class Take:
         return simulation.calm_frames + simulation.approach_frames + simulation.rest_frames
 
 
-def prepare_take(config: SynthConfig) -> Take:
+def plan_take(config: SynthConfig) -> TakePlan:
     """Body, motion and meshes of a configuration. Each random part has its own stream of the one seed."""
     streams = {
         name: np.random.default_rng([config.seed, number])
@@ -101,7 +114,7 @@ def prepare_take(config: SynthConfig) -> Take:
     meshes = {name: mesh_pattern(first, count, streams[name]) for name, count in counts.items()}
     if config.drafted_for is not None:
         meshes = {name: grade(mesh, first, pattern) for name, mesh in meshes.items()}
-    return Take(
+    return TakePlan(
         config=config,
         shaped=shaped,
         poses=poses,
@@ -111,14 +124,21 @@ def prepare_take(config: SynthConfig) -> Take:
         fine=meshes["fine"],
         template=meshes["template"],
         wrinkles=wrinkle_mesh(meshes["coarse"], meshes["fine"], config.relaxation, streams["imperfection"]),
+        paint=_paint(OUTFITS[config.outfit], meshes["fine"], shaped),
     )
+
+
+def _paint(outfit: Outfit, fine: PanelMesh, shaped: ShapedBody) -> Paint:
+    is_border = painted_band(fine)
+    garment = np.where(is_border[:, None], outfit.border, outfit.garment).astype(np.uint8)
+    return Paint(garment, is_border, dress_colours(shaped, outfit))
 
 
 def _person(shape: tuple[float, ...]) -> ShapedBody:
     return with_shape(load_anny(), np.array(shape, np.float32))
 
 
-def simulate_take(take: Take) -> Iterator[tuple[int, np.ndarray, np.ndarray | None]]:
+def simulate_take(take: TakePlan) -> Iterator[tuple[int, np.ndarray, np.ndarray | None]]:
     """Simulate a take, coarse and fine.
 
     Yields:
@@ -150,7 +170,7 @@ def simulate_take(take: Take) -> Iterator[tuple[int, np.ndarray, np.ndarray | No
             yield index, coarse, None if future is None else future.result()
 
 
-def measured_poses(take: Take) -> PoseSequence:
+def measured_poses(take: TakePlan) -> PoseSequence:
     """The poses as motion capture would give them: each joint off by a slowly varying rotation."""
     rng = np.random.default_rng([take.config.seed, 100])
     poses = take.poses
@@ -187,19 +207,11 @@ def take_rig(config: SynthConfig, extent: np.ndarray) -> Rig:
     return scanner_rig(config.scanner, centre=centre, radius=max(radius, RIG_RADIUS_M))
 
 
-def take_surfaces(take: Take, fine: np.ndarray, surface: np.ndarray) -> list[Surface]:
+def take_surfaces(take: TakePlan, fine: np.ndarray, surface: np.ndarray) -> list[Surface]:
     """What the scanner sees of a frame: the painted garment, (V, 3), and the body in its suit, (B, 3); float32."""
-    fusion, (cloth, painted, dress) = take.config.scanner.fusion, _colours(take)
+    fusion, paint = take.config.scanner.fusion, take.paint
     faces = take.shaped.body.template.faces
     return [
-        Surface(Mesh(fine, take.fine.faces), cloth, LABEL_GARMENT, fusion.garment_voxel_m, painted),
-        Surface(Mesh(surface, faces), dress, LABEL_BODY, fusion.body_voxel_m),
+        Surface(Mesh(fine, take.fine.faces), paint.garment, LABEL_GARMENT, fusion.garment_voxel_m, paint.is_border),
+        Surface(Mesh(surface, faces), paint.body, LABEL_BODY, fusion.body_voxel_m),
     ]
-
-
-@lru_cache(maxsize=1)
-def _colours(take: Take) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of the garment (V, 3), where it is painted (V,), and of the body (B, 3): the same in every frame of a take."""
-    outfit, painted = OUTFITS[take.config.outfit], painted_band(take.fine)
-    cloth = np.where(painted[:, None], outfit.border, outfit.garment).astype(np.uint8)
-    return cloth, painted, dress_colours(take.shaped, outfit)

@@ -19,8 +19,11 @@ from capture4d.runs.stage import Stage, StageResult, open_stage
 from capture4d.runs.workers import run_jobs
 from data_synth.config import SynthConfig, TrainingSetConfig
 from data_synth.stage import (
+    ScanJob,
+    Scene,
     finish_take,
     is_whole,
+    open_scene,
     open_take,
     scan_frame,
     scan_jobs,
@@ -57,7 +60,7 @@ def run(output: Path, config: TrainingSetConfig, *, workers: int = 2, overwrite:
     ):  # fmt: skip
         pass
     scans = [job for each in takes.values() for job in scan_jobs(*each)]
-    for _ in run_jobs(scan_frame, scans, workers=workers, label="Scanning"):
+    for _ in run_jobs(_scan, scans, prepare=_Scenes, workers=workers, label="Scanning"):
         pass
     digests = {name: _finish(output, config, *each).digest for name, each in takes.items()}
     note = {"held_out": config.held_out, "reversed": config.reversed, "bodies": config.bodies, "digests": digests}
@@ -80,6 +83,23 @@ def body_takes(config: TrainingSetConfig) -> Mapping[str, Mapping[str, SynthConf
         }
         for who, shape in config.bodies.items()
     }
+
+
+class _Scenes:
+    """The scene of the take that a process is at: jobs come take by take, and a scene is too large to keep them all."""
+
+    def __init__(self) -> None:
+        self._path: Path | None = None
+        self._scene: Scene | None = None
+
+    def of(self, job: ScanJob) -> Scene:
+        if self._scene is None or self._path != job.stage.path:
+            self._path, self._scene = job.stage.path, open_scene(job.stage, job.config)
+        return self._scene
+
+
+def _scan(scenes: _Scenes, job: ScanJob) -> int:
+    return scan_frame(scenes.of(job), job)
 
 
 def _finish(output: Path, config: TrainingSetConfig, stage: Stage, take: SynthConfig) -> StageResult:

@@ -10,14 +10,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float64, Integer
+from jaxtyping import Bool, Float, Float64, Integer
 from scipy import sparse
 from scipy.spatial import KDTree
 
 from capture4d.geometry.mesh_kernels import laplacian_pass, mean_edge_length, open_vertices, vertex_normals_kernel
 from capture4d.geometry.point_grid import PointGrid
 
-__all__ = ["Matches", "ScanSurface", "match", "match_both_ways", "mesh_normals", "prepare_scan"]
+__all__ = ["Gates", "Matches", "ScanSurface", "match", "match_both_ways", "mesh_normals", "prepare_scan"]
 
 
 SECOND_LAYER = 2.0
@@ -37,6 +37,26 @@ class ScanSurface:
     grid: PointGrid
     spacing: float
     """Mean edge length, metres: what the scan resolves."""
+
+
+@dataclass(frozen=True, slots=True)
+class Gates:
+    """Which matches count, and how much."""
+
+    distance: float
+    """Largest, metres."""
+    normal_cosine: float
+    """Least, between the normals of the point and of the scan."""
+    robust_scale: float
+    """Scale of the weight (1 + (d/s)^2)^-2 as a share of the largest distance."""
+
+    def weigh(
+        self, away: Float64[np.ndarray, " queries"], closed: Bool[np.ndarray, " queries"]
+    ) -> Float64[np.ndarray, " queries"]:
+        """Geman-McClure weights of residuals, metres; 0 where the gates are closed."""
+        weights = 1.0 / (1.0 + (away / (self.robust_scale * self.distance)) ** 2) ** 2
+        weights[closed] = 0.0
+        return weights
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,28 +101,21 @@ def match(
     surface: ScanSurface,
     points: Float64[np.ndarray, "queries 3"],
     normals: Float64[np.ndarray, "queries 3"],
-    *,
-    gate: float,
-    min_normal_cosine: float,
-    robust_scale: float,
+    gates: Gates,
 ) -> Matches:
     """Nearest scan vertex of each point, gated in distance and normal, with Geman-McClure weights.
 
     A point whose nearest scan vertex looks another way, as on two layers of cloth, takes the nearest that does not, if
-    there is one close beside it.
-
-    Args:
-        gate: largest distance, metres.
-        robust_scale: scale of the weight (1 + (d/s)^2)^-2 as a share of the gate, d measured along the scan's normal.
+    there is one close beside it. Weights are by the distance along the scan's normal.
     """
-    distances, indices = surface.grid.query(points, gate)
+    distances, indices = surface.grid.query(points, gates.distance)
     found = indices < len(surface.points)
     nearest = np.where(found, indices, 0)
     cosine = np.einsum("va,va->v", normals, surface.normals[nearest])
-    turned = np.flatnonzero(found & (cosine < min_normal_cosine))
-    bounds = np.minimum(np.hypot(distances[turned], SECOND_LAYER * surface.spacing), gate)
+    turned = np.flatnonzero(found & (cosine < gates.normal_cosine))
+    bounds = np.minimum(np.hypot(distances[turned], SECOND_LAYER * surface.spacing), gates.distance)
     further, others = surface.grid.query_facing(
-        points[turned], normals[turned], bounds, surface.normals, min_normal_cosine
+        points[turned], normals[turned], bounds, surface.normals, gates.normal_cosine
     )
     better = np.isfinite(further)
     changed = turned[better]
@@ -110,19 +123,15 @@ def match(
     cosine[changed] = np.einsum("va,va->v", normals[changed], surface.normals[nearest[changed]])
     target, target_normal = surface.points[nearest], surface.normals[nearest]
     off_plane = np.einsum("va,va->v", points - target, target_normal)
-    weights = 1.0 / (1.0 + (off_plane / (robust_scale * gate)) ** 2) ** 2
-    weights[~found | (cosine < min_normal_cosine)] = 0.0
-    return Matches(target, target_normal, weights)
+    return Matches(target, target_normal, gates.weigh(off_plane, ~found | (cosine < gates.normal_cosine)))
 
 
 def match_both_ways(
     surface: ScanSurface,
     points: Float64[np.ndarray, "queries 3"],
     normals: Float64[np.ndarray, "queries 3"],
+    gates: Gates,
     *,
-    gate: float,
-    min_normal_cosine: float,
-    robust_scale: float,
     neighbours: int,
     max_points: int,
     normal_length: float,
@@ -154,9 +163,8 @@ def match_both_ways(
     normal = mixing @ surface.normals[voters]
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     away = np.linalg.norm(points - target, axis=1)
-    weights = 1.0 / (1.0 + (away / (robust_scale * gate)) ** 2) ** 2
-    weights[(away > gate) | (np.einsum("va,va->v", normals, normal) < min_normal_cosine)] = 0.0
-    return Matches(target, normal, weights)
+    turned = np.einsum("va,va->v", normals, normal) < gates.normal_cosine
+    return Matches(target, normal, gates.weigh(away, (away > gates.distance) | turned))
 
 
 def _affinity(distance: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ from capture4d.errors import InputError
 from capture4d.types import GarmentScan
 from registration.boundary import BorderTargets, border_targets, tangent_free_metric
 from registration.config import BoundaryRule, RegistrationConfig, Schedule
-from registration.correspondences import ScanSurface, match, match_both_ways, mesh_normals, prepare_scan
+from registration.correspondences import Gates, ScanSurface, match, match_both_ways, mesh_normals, prepare_scan
 from registration.deformation_graph import identity_nodes, node_edge_rows, rows_of_vertices, smooth_rows
 from registration.energies import edge_vectors, plane_metric, rigid_term, stretch_metric, tangential_metric
 from registration.fold_lengths import folded_lengths
@@ -139,8 +139,8 @@ def _coarse_stage(
                 f"frame {scan.frame_id}: expected scan vertices within {schedule.gate[0]:g} m of the start, found none"
             )
         terms += _border_terms(
-            analysis, border_rows, scan, vertices, config.boundary.coarse_rule, False,
-            anneal(schedule.boundary, *at), config,
+            analysis, border_rows, scan, vertices, anneal(schedule.boundary, *at), config.boundary.gate,
+            rule=config.boundary.coarse_rule, along_curve=False,
         )  # fmt: skip
         smooth = anneal(schedule.smooth, *at) / max(len(node_constant), 1)
         metric = np.broadcast_to(smooth * np.eye(3), (len(node_constant), 3, 3))
@@ -191,8 +191,8 @@ def _dense_stage(
         gate = anneal(schedule.gate, *at)
         terms = [_data_term(analysis.vertex_rows, scan.surface, vertices, normals, gate, config)]
         terms += _border_terms(
-            analysis, border_rows, scan, vertices, config.boundary.dense_rule, config.boundary.along_curve,
-            anneal(schedule.boundary, *at), config,
+            analysis, border_rows, scan, vertices, anneal(schedule.boundary, *at), config.boundary.gate,
+            rule=config.boundary.dense_rule, along_curve=config.boundary.along_curve,
         )  # fmt: skip
         stretch, excess = stretch_metric(
             edge_vectors(vertices, analysis.edges), lengths,
@@ -219,17 +219,12 @@ def _data_term(
     rows: Rows, surface: ScanSurface, points: np.ndarray, normals: np.ndarray, gate: float, config: RegistrationConfig
 ) -> RowTerm:
     data = config.data
+    gates = Gates(gate, data.min_normal_cosine, data.robust_scale)
     if data.rule == "both_ways":
-        found = match_both_ways(
-            surface, points, normals, gate=gate, min_normal_cosine=data.min_normal_cosine,
-            robust_scale=data.robust_scale, neighbours=3, max_points=data.max_voters,
-            normal_length=data.normal_length,
-        )  # fmt: skip
+        voters, length = data.max_voters, data.normal_length
+        found = match_both_ways(surface, points, normals, gates, neighbours=3, max_points=voters, normal_length=length)
     else:
-        found = match(
-            surface, points, normals,
-            gate=gate, min_normal_cosine=data.min_normal_cosine, robust_scale=data.robust_scale,
-        )  # fmt: skip
+        found = match(surface, points, normals, gates)
     metric = plane_metric(found.normals, found.weights / len(points), data.point_share)
     return RowTerm(rows, metric, points - found.points)
 
@@ -239,15 +234,16 @@ def _border_terms(
     rows: Rows,
     scan: FrameScan,
     vertices: np.ndarray,
+    weight: float,
+    gate: float,
+    *,
     rule: BoundaryRule,
     along_curve: bool,
-    weight: float,
-    config: RegistrationConfig,
 ) -> list[RowTerm]:
     border = analysis.border
     positions = vertices[border.vertices]
     targets: BorderTargets = border_targets(
-        positions, border.loops, scan.border_points, scan.border_loops, rule=rule, gate=config.boundary.gate
+        positions, border.loops, scan.border_points, scan.border_loops, rule=rule, gate=gate
     )
     if not targets.valid.any() or weight == 0.0:
         return []

@@ -32,49 +32,35 @@ class _Scheme:
     """Our limb joint -> the file's joint whose offset tells the limb's rest direction."""
 
 
-def _cmu(hip: str, knee: str, ankle: str, spine: tuple[str, ...], neck: tuple[str, ...], collar: str, shoulder: str,
-         elbow: str, wrist: str) -> _Scheme:  # fmt: skip
-    drives = {"root": "Hips", "spine05": spine[0], "spine03": spine[1], "spine01": spine[2]}
-    drives |= {"neck01": neck[0], "neck02": neck[1], "head": "Head"}
-    limbs = {}
-    for side, word in (("L", "Left"), ("R", "Right")):
+def _scheme(
+    trunk: dict[str, str], sides: tuple[str, str], leg: tuple[str, str, str], arm: tuple[str, str, str, str]
+) -> _Scheme:
+    """A scheme that names joints of the limbs by the side and the part.
+
+    Args:
+        trunk: our joint -> the file's joint.
+        sides: what the names of left and right begin with.
+        leg: hip, knee, ankle.
+        arm: collar, shoulder, elbow, wrist.
+    """
+    drives, limbs = dict(trunk), {}
+    for side, word in zip("LR", sides, strict=True):
+        hip, knee, ankle = (word + part for part in leg)
+        collar, shoulder, elbow, wrist = (word + part for part in arm)
         drives |= {
-            f"upperleg01.{side}": word + hip,
-            f"lowerleg01.{side}": word + knee,
-            f"foot.{side}": word + ankle,
-            f"clavicle.{side}": word + collar,
-            f"upperarm01.{side}": word + shoulder,
-            f"lowerarm01.{side}": word + elbow,
-            f"wrist.{side}": word + wrist,
+            f"upperleg01.{side}": hip,
+            f"lowerleg01.{side}": knee,
+            f"foot.{side}": ankle,
+            f"clavicle.{side}": collar,
+            f"upperarm01.{side}": shoulder,
+            f"lowerarm01.{side}": elbow,
+            f"wrist.{side}": wrist,
         }
         limbs |= {
-            f"upperleg01.{side}": word + knee,
-            f"lowerleg01.{side}": word + ankle,
-            f"upperarm01.{side}": word + elbow,
-            f"lowerarm01.{side}": word + wrist,
-        }
-    return _Scheme(drives, limbs)
-
-
-def _smpl() -> _Scheme:
-    drives = {"root": "pelvis", "spine05": "spine1", "spine03": "spine2", "spine01": "spine3"}
-    drives |= {"neck01": "neck", "head": "head"}
-    limbs = {}
-    for side, word in (("L", "left_"), ("R", "right_")):
-        drives |= {
-            f"upperleg01.{side}": word + "hip",
-            f"lowerleg01.{side}": word + "knee",
-            f"foot.{side}": word + "ankle",
-            f"clavicle.{side}": word + "collar",
-            f"upperarm01.{side}": word + "shoulder",
-            f"lowerarm01.{side}": word + "elbow",
-            f"wrist.{side}": word + "wrist",
-        }
-        limbs |= {
-            f"upperleg01.{side}": word + "knee",
-            f"lowerleg01.{side}": word + "ankle",
-            f"upperarm01.{side}": word + "elbow",
-            f"lowerarm01.{side}": word + "wrist",
+            f"upperleg01.{side}": knee,
+            f"lowerleg01.{side}": ankle,
+            f"upperarm01.{side}": elbow,
+            f"lowerarm01.{side}": wrist,
         }
     return _Scheme(drives, limbs)
 
@@ -113,11 +99,21 @@ AIMS = {
 """The joint that each joint of SMPL's chains carries next."""
 
 SCHEMES = (
-    _smpl(),
-    _cmu("UpLeg", "Leg", "Foot", ("LowerBack", "Spine", "Spine1"), ("Neck", "Neck1"), "Shoulder", "Arm", "ForeArm",
-         "Hand"),
-    _cmu("Hip", "Knee", "Ankle", ("lowerback", "Chest", "Chest2"), ("lowerneck", "Neck"), "Collar", "Shoulder",
-         "Elbow", "Wrist"),
+    _scheme(
+        {"root": "pelvis", "spine05": "spine1", "spine03": "spine2", "spine01": "spine3",
+         "neck01": "neck", "head": "head"},
+        ("left_", "right_"), leg=("hip", "knee", "ankle"), arm=("collar", "shoulder", "elbow", "wrist"),
+    ),
+    _scheme(
+        {"root": "Hips", "spine05": "LowerBack", "spine03": "Spine", "spine01": "Spine1",
+         "neck01": "Neck", "neck02": "Neck1", "head": "Head"},
+        ("Left", "Right"), leg=("UpLeg", "Leg", "Foot"), arm=("Shoulder", "Arm", "ForeArm", "Hand"),
+    ),
+    _scheme(
+        {"root": "Hips", "spine05": "lowerback", "spine03": "Chest", "spine01": "Chest2",
+         "neck01": "lowerneck", "neck02": "Neck", "head": "Head"},
+        ("Left", "Right"), leg=("Hip", "Knee", "Ankle"), arm=("Collar", "Shoulder", "Elbow", "Wrist"),
+    ),
 )  # fmt: skip
 """SMPL's naming, and the two of the CMU Graphics Lab database."""
 

@@ -26,15 +26,19 @@ from capture4d.errors import InputError
 from capture4d.files.arrays import ArrayFile
 from capture4d.files.atomic import read_json, write_json, write_npz
 from capture4d.files.records import load_rig, save_rig
+from capture4d.runs.file_stage import open_file_stage
+from capture4d.runs.stage import StageResult
 from capture4d.runs.workers import run_jobs
 
-__all__ = ["BoardImage", "convert", "find_images", "run", "run_check"]
+__all__ = ["BoardImage", "CalibrationResult", "convert", "find_images", "read_covariance", "run", "run_check"]
 
 PATTERN = "{camera}/{pose}"
 ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 DETECTOR = "fitted pattern"
 """Corners that an earlier detector has kept are found anew."""
 REPORT, CORNERS, COVARIANCE = "calibration.json", "calibration_corners.npz", "calibration_covariance.npz"
+RECORD = "calibration_stage.json"
+SCHEMA = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +48,14 @@ class BoardImage:
     camera: str
     pose: str
     path: Path
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class CalibrationResult(StageResult):
+    """A rig that was calibrated, and how good it is."""
+
+    report: Mapping[str, Any]
+    """What calibration.json says."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,24 +75,57 @@ def run(
     pattern: str = PATTERN,
     colmap: Path | None = None,
     workers: int = 1,
-) -> dict[str, Any]:
-    """Calibrate the rig that took a folder of images; what calibration.json says.
+    overwrite: bool = False,
+) -> CalibrationResult:
+    """Calibrate the rig that took a folder of images, unless that is done.
 
-    The corners are kept beside the rig, so that a run after a failure, or with other settings, detects only new images.
+    The corners are kept beside the rig, so that a run after a failure, with more images or with other settings, detects
+    only new images.
 
     Args:
         output: rig.json to write; calibration.json goes beside it.
         board: as `parse_board` takes it.
         pattern: how the images lie in the folder.
         colmap: folder for the rig as a COLMAP model as well.
+        overwrite: calibrate anew, also over a rig of other settings.
     Raises:
         InputError: names the image, the camera, or the argument at fault.
+        StaleError: there is a rig that was calibrated with other settings.
     """
     geometry = parse_board(board)
     found = find_images(images, pattern)
-    names, poses = (sorted({getattr(image, key) for image in found}, key=_natural) for key in ("camera", "pose"))
+    poses = sorted({image.pose for image in found}, key=_natural)
     if config.floor is not None and config.floor not in poses:
         raise InputError(f"--floor: expected one of the poses {poses[0]} to {poses[-1]}, found '{config.floor}'")
+    stage = open_file_stage(
+        output.with_name(RECORD),
+        name="calibrate",
+        schema=SCHEMA,
+        config={"board": board, "pattern": pattern, **dataclasses.asdict(config)},
+        upstream={"images": _images_digest(found, images)},
+        sources={"images": images},
+        overwrite=overwrite,
+    )
+    files = [output, output.with_name(REPORT), output.with_name(COVARIANCE)]
+    digest = stage.made(files)
+    if digest is None:
+        _calibrate(found, images, output, board, geometry, config, workers)
+        digest = stage.finish(files)
+    if colmap is not None:
+        write_model(colmap, load_rig(output))
+    return CalibrationResult(output, digest, report=read_json(output.with_name(REPORT)))
+
+
+def _calibrate(
+    found: Sequence[BoardImage],
+    images: Path,
+    output: Path,
+    board: str,
+    geometry: Board,
+    config: CalibrationConfig,
+    workers: int,
+) -> None:
+    names, poses = (sorted({getattr(image, key) for image in found}, key=_natural) for key in ("camera", "pose"))
     detections = _detect_all(found, geometry, output.with_name(CORNERS), images, workers)
     sizes = _image_sizes(detections, names)
     calibration = calibrate_rig(
@@ -93,8 +138,6 @@ def run(
         config=config,
     )
     save_rig(output, calibration.estimate.rig)
-    if colmap is not None:
-        write_model(colmap, calibration.estimate.rig)
     report = calibration_report(calibration, geometry, pose_names=poses, config=config)
     report = {"format": 1, "board": board, "images": len(found), "config": dataclasses.asdict(config), **report}
     digest = _rig_digest(output)
@@ -102,7 +145,6 @@ def run(
         output.with_name(COVARIANCE), names=np.array(names), covariance=calibration.covariance, rig=np.array(digest)
     )
     write_json(output.with_name(REPORT), {**report, "rig": digest})
-    return report
 
 
 def run_check(
@@ -142,7 +184,7 @@ def run_check(
         if detection.size != (width, height):
             seen = "x".join(str(size) for size in detection.size)
             raise InputError(f"{detection.image.path}: expected {width}x{height} pixels as in the rig, found {seen}")
-    covariance = _read_covariance(rig_path.with_name(COVARIANCE), digest, cameras=len(rig.names))
+    covariance = read_covariance(rig_path, cameras=len(rig.names))
     return check_rig(rig, _views(detections, rig.names, poses), geometry, covariance=covariance, config=config)
 
 
@@ -262,6 +304,10 @@ def _file_key(image: BoardImage, folder: Path) -> str:
     return f"{image.path.relative_to(folder).as_posix()} {status.st_size} {status.st_mtime_ns}"
 
 
+def _images_digest(images: Sequence[BoardImage], folder: Path) -> str:
+    return hashlib.sha256("\n".join(sorted(_file_key(image, folder) for image in images)).encode()).hexdigest()
+
+
 def _image_sizes(detections: Sequence[_Detection], names: Sequence[str]) -> np.ndarray:
     """(C, 2) int32: width and height, which have to be the same in all images of a camera."""
     first: dict[str, _Detection] = {}
@@ -290,16 +336,19 @@ def _rig_digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def _read_covariance(path: Path, rig_digest: str, *, cameras: int) -> np.ndarray | None:
-    """Of the calibration, (C, 14, C, 14), if it is that of this rig."""
+def read_covariance(rig_path: Path, *, cameras: int) -> np.ndarray | None:
+    """Of the calibration beside a rig, (C, 14, C, 14), if it is that of this rig."""
+    path = rig_path.with_name(COVARIANCE)
     if not path.is_file():
         return None
     with ArrayFile(path) as arrays:
-        if str(arrays.get("rig")) != rig_digest:
+        if str(arrays.get("rig")) != _rig_digest(rig_path):
             return None
         covariance = arrays["covariance"]
     if covariance.shape != (cameras, CAMERA_UNKNOWNS) * 2:
-        raise InputError(f"{path}: expected {cameras} x {CAMERA_UNKNOWNS} unknowns squared, found {covariance.shape}")
+        raise InputError(
+            f"expected {cameras} x {CAMERA_UNKNOWNS} unknowns squared, found {covariance.shape}", where=path
+        )
     return covariance
 
 

@@ -54,8 +54,8 @@ class Check:
         import json
 
         from capture4d.app.report.check import as_json, print_table, status
-        from capture4d.preflight.fix import write_fixed
-        from capture4d.preflight.stage import check_take
+        from capture4d.preflight.fix import fixed_path
+        from capture4d.preflight.stage import run
         from capture4d.preflight.take_folder import Claims
 
         claims = Claims(
@@ -68,14 +68,14 @@ class Check:
             self.poses,
             self.body,
         )
-        checked = check_take(self.capture, claims, all_frames=self.all or self.fix, workers=self.workers)
-        fixed = write_fixed(checked, workers=self.workers) if self.fix and checked.verdict.findings else None
+        output = fixed_path(self.capture) if self.fix else None
+        checked = run(self.capture, output, claims, all_frames=self.all, workers=self.workers)
         if self.json:
-            print(json.dumps(as_json(checked, fixed=fixed), indent=2))
+            print(json.dumps(as_json(checked), indent=2))
         else:
             print_table(checked)
-            if fixed is not None:
-                print(f"corrected: {fixed}")
+            if checked.fixed is not None:
+                print(f"corrected: {checked.fixed}")
         bad = ("warnings", "errors") if self.strict else ("errors",)
         return BAD_RESULT if status(checked.verdict) in bad else GOOD
 
@@ -96,13 +96,15 @@ class Calibrate:
     """Processes to use; the result does not depend on it."""
     colmap: Path | None = None
     """Folder for the rig as a COLMAP model as well."""
+    overwrite: bool = False
+    """Calibrate anew, also over a rig of other settings; corners that are known stay known."""
     config: Annotated[CalibrationConfig, arg(name="")] = field(default_factory=CalibrationConfig)
 
     def __call__(self) -> int:
         from capture4d.app.report.calibration import print_calibration, write_page
         from capture4d.calibration.stage import run
 
-        report = run(
+        result = run(
             self.images,
             self.output,
             self.board,
@@ -110,10 +112,11 @@ class Calibrate:
             pattern=self.pattern,
             colmap=self.colmap,
             workers=self.workers,
+            overwrite=self.overwrite,
         )
-        print_calibration(report)
-        page = write_page(self.output.with_name("calibration.html"), report)
-        print(f"rig: {self.output}, report: {page}")
+        print_calibration(result.report)
+        page = write_page(self.output.with_name("calibration.html"), result.report)
+        print(f"rig: {result.path}, report: {page}")
         return GOOD
 
 

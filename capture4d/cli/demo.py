@@ -83,6 +83,6 @@ def _calibrate_demo(truth: Path, folder: Path, *, workers: int, overwrite: bool)
 
     config = BoardConfig(poses=BOARD_POSES)
     photograph(truth, folder / "board", config, workers=workers, overwrite=overwrite)
-    if overwrite or not (folder / "calibration.html").is_file():
-        report = calibrate(folder / "board", folder / "rig.json", config.board, workers=workers)
-        write_page(folder / "calibration.html", report)
+    rig = folder / "rig.json"
+    calibrated = calibrate(folder / "board", rig, config.board, workers=workers, overwrite=overwrite)
+    write_page(folder / "calibration.html", calibrated.report)

@@ -11,6 +11,7 @@ from tyro.conf import Positional, arg
 
 from capture4d.cli.exit_codes import BAD_RESULT, GOOD
 from capture4d.settings import Positive, Whole
+from capture4d.templates.config import Region, TemplateConfig, UvChoice
 from registration.config import MeshRegistrationConfig
 
 __all__ = ["ConvertBody", "ConvertPoses", "ConvertRig", "RegisterMesh", "Template"]
@@ -31,9 +32,9 @@ class Template:
     absent."""
     frame: Whole | None = None
     """Frame of that file, by its number; the first if absent."""
-    region: Literal["tshirt", "longsleeve", "trousers", "shorts"] | None = None
+    region: Region | None = None
     """Take this part of the body as the garment."""
-    uv: Literal["auto", "keep", "fresh", "none"] = "auto"
+    uv: UvChoice = "auto"
     """Keep the mesh's UVs or cut fresh ones; `auto` keeps them if nothing is wrong with them."""
     names: tuple[str, ...] = ()
     """Names of the border loops, the one with the most vertices first; found by their place if absent."""
@@ -43,17 +44,9 @@ class Template:
     def __call__(self) -> int:
         from capture4d.templates.stage import run
 
-        garment, report = run(
-            self.mesh,
-            self.output,
-            body=self.body,
-            poses=self.poses,
-            frame=self.frame,
-            region=self.region,
-            uv=self.uv,
-            names=self.names,
-            units=self.units,
-        )
+        config = TemplateConfig(self.frame, self.region, self.uv, self.names, self.units)
+        result = run(self.mesh, self.output, config, body=self.body, poses=self.poses)
+        garment, report = result.garment, result.report
         loops = ", ".join(f"{name} ({len(loop)})" for name, loop in garment.loops.items())
         faults = ", ".join(report.uv.faults())
         cut = f"cut afresh{f' ({faults})' if faults else ''}"
@@ -61,7 +54,7 @@ class Template:
         print(f"{report.vertices} vertices, {report.faces} faces, {1e3 * report.distance_m:.1f} mm from the body")
         print(f"borders: {loops}")
         print(f"UVs: {uvs}")
-        print(f"template: {self.output}")
+        print(f"template: {result.path}")
         return GOOD
 
 

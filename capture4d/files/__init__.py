@@ -1,1 +1,1 @@
-"""One value, one file: meshes, arrays, records. Whole or not there at all; errors name the file and the line."""
+"""One value, one file: meshes, arrays, records; whole or not there at all, and errors name the file and the line."""

@@ -1,9 +1,9 @@
 """`capture4d check --fix`: the take again, without what is safely repaired. The original is only read.
 
 Scans, and a bare template, are rewritten in metres, Y up, faces outside, feet on the floor; poses move along if they
-share the floor; frames that cannot be used are left out and named
-in capture.json as dropped. Frame numbers stay: a frame's time follows from its number. What needs a person's judgement
-(paint, light, calibration, other people's poses) stays as it is.
+share the floor; frames that cannot be used are left out and named in capture.json as dropped. Frame numbers stay: a
+frame's time follows from its number. What needs a person's judgement (paint, light, calibration, other people's poses)
+stays as it is.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from capture4d.errors import InputError
 from capture4d.files.atomic import write_json
 from capture4d.files.meshes import MESH_SUFFIXES, read_mesh, write_mesh
 from capture4d.files.records import load_poses, save_poses, save_rig
-from capture4d.preflight.stage import Checked
+from capture4d.preflight.check import Checked
+from capture4d.preflight.facts import BadFrame
 from capture4d.preflight.statistics import outwardness
 from capture4d.preflight.take_folder import TakeFolder, read_frame
-from capture4d.preflight.verdict import BadFrame
 from capture4d.runs.workers import run_jobs
 
 __all__ = ["fixed_path", "write_fixed"]
@@ -44,26 +44,30 @@ class _Job:
 
 
 def fixed_path(capture: Path) -> Path:
+    """Where the corrected take goes unless told otherwise: next to the original."""
     capture = capture.resolve()
     return capture.parent / f"{capture.name}-fixed"
 
 
-def write_fixed(checked: Checked, *, workers: int = 1) -> Path:
-    """Write the corrected take next to the original; the new folder. It is there whole or not at all.
+def write_fixed(checked: Checked, output: Path | None = None, *, workers: int = 1) -> Path:
+    """Write the corrected take; the new folder. It is there whole or not at all.
+
+    Args:
+        output: that folder; `fixed_path` if None.
 
     Raises:
         InputError: the folder exists, or no frame is left.
     """
-    take, output = checked.take, fixed_path(checked.take.path)
+    take, output = checked.take, output or fixed_path(checked.take.path)
     if output.exists():
-        raise InputError(f"{output}: already there, expected to write the corrected take there; remove it first")
+        raise InputError("already there, expected to write the corrected take there; remove it first", where=output)
     if checked.survey is None:
-        raise InputError(f"{take.path}: no readable frame, nothing to correct")
+        raise InputError("no readable frame, nothing to correct", where=take.path)
     placement = checked.survey.placement
     unusable = _unusable(checked)
     kept = [number for number in take.files if number not in unusable]
     if not kept:
-        raise InputError(f"{take.path}: no usable frame, nothing to correct")
+        raise InputError("no usable frame, nothing to correct", where=take.path)
     partial = output.with_name(f".{output.name}.partial")
     if partial.exists():  # of a run that was killed
         shutil.rmtree(partial)

@@ -10,83 +10,34 @@ import hashlib
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float64, UInt8
+from jaxtyping import Float, Float64
 from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.spatial import KDTree
 
-from capture4d.colours.labels import FIRST_PAINT, GARMENT, OTHER, classify_colours
-from capture4d.colours.spaces import Colour, colour_angles, to_lab
+from capture4d.cameras.coverage import best_share, camera_counts
+from capture4d.colours.labels import OTHER
 from capture4d.geometry.mesh import boundary_edges, doubled_area_vectors, face_areas, vertex_normals
 from capture4d.geometry.mesh_kernels import open_vertices
+from capture4d.preflight.colour_statistics import ColourStatistics, colour_statistics, paint_labels
+from capture4d.preflight.facts import Paints
 from capture4d.types import Mesh, Rig, Scan
 
 __all__ = [
-    "ColourStatistics",
     "FrameStatistics",
-    "Paints",
-    "camera_counts",
-    "colour_statistics",
     "hole_share",
     "measure_frame",
     "outwardness",
-    "rig_middle",
     "surface_noise",
     "surface_shift",
 ]
 
 NOISE_SAMPLES, NOISE_NEIGHBOURS = 600, 12
-
-
 SHIFT_SAMPLES = 1500
-
-
-RIG_SAMPLES, RIG_STEP_M = 200, 0.3
-
-
-STRAY_DISTANCE_M = 0.06
-"""Paint farther from the cloth than this is on something else: bands are a few centimetres wide."""
-
-
 LARGEST_HOLE_M = 0.6
 """Rims longer than this are openings of the garment or the edge of the scanned volume."""
-
-
 POSE_CLIP_M = 0.12
 """Hair, tools and strangers count no more than this in the distance to the posed body."""
-
-
-WEDGE_DEG = 30.0
-"""Hues within this angle of the garment's are the garment's, however pale."""
-
-
-@dataclass(frozen=True, slots=True)
-class Paints:
-    """Colours that the take's description promises."""
-
-    garment: Colour | None = None
-    borders: tuple[Colour, ...] = ()
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ColourStatistics:
-    """Colours of one scan. Shares are of its vertices."""
-
-    chroma: float
-    """CIELAB chroma that one vertex in a hundred exceeds."""
-    clipped: float
-    """Share of vertices at or near white in every channel."""
-    garment: float
-    """Share of garment-coloured vertices."""
-    garment_chroma: float
-    """Chroma that a hundredth of the vertices of the garment's hue exceed: a grey suit has some hue, but little chroma.
-    NaN where there are hardly any."""
-    garment_spread: float
-    """Angle in linear RGB, radians, that 95 % of the garment's vertices keep to the garment's colour; NaN likewise."""
-    borders: tuple[float, ...]
-    """Share of each paint."""
-    stray: tuple[float, ...]
-    """Share of each paint's vertices that are far from any cloth."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,7 +99,7 @@ def measure_frame(
     dressed = np.zeros(len(vertices), bool)
     colours = None
     if has_colours:
-        labels = _labels(scan.colours, paints)
+        labels = paint_labels(scan.colours, paints)
         colours = colour_statistics(scan, labels, paints)
         dressed = labels > OTHER
     garment = (vertices[dressed] if dressed.mean() > 0.05 else vertices)[::7]
@@ -167,7 +118,7 @@ def measure_frame(
         content=hashlib.sha256(mesh.vertices.tobytes()).hexdigest()[:16],
         colours=colours,
         camera_share=None if rig is None else float(camera_counts(rig, garment).mean() / max(len(rig.names), 1)),
-        best_share=None if rig is None else _best_share(rig, garment),
+        best_share=None if rig is None else best_share(rig, garment),
         pose_distance_m=None if body is None else _mean_distance(bare, body),
     )
 
@@ -244,89 +195,3 @@ def surface_shift(before: Mesh, after: Mesh) -> float:
 def _mean_distance(points: np.ndarray, body: np.ndarray) -> float:
     chosen = points[np.linspace(0, len(points) - 1, min(SHIFT_SAMPLES, len(points))).astype(int)]
     return float(np.minimum(KDTree(body).query(chosen, distance_upper_bound=POSE_CLIP_M)[0], POSE_CLIP_M).mean())
-
-
-def camera_counts(rig: Rig, points: Float[np.ndarray, "points 3"]) -> np.ndarray:
-    """In how many cameras' images each point lies, (points,); what hides it is not considered, nor lens distortion."""
-    counts = np.zeros(len(points), np.int32)
-    for camera in range(len(rig.names)):
-        T, (width, height) = rig.T_camera_world[camera], rig.image_sizes[camera]
-        seen = points @ T[:3, :3].T + T[:3, 3]
-        pixels = seen @ rig.intrinsics[camera].T
-        depth = np.maximum(pixels[:, 2], 1e-9)
-        u, v = pixels[:, 0] / depth, pixels[:, 1] / depth
-        counts += (seen[:, 2] > 0) & (u > -0.5) & (u < width - 0.5) & (v > -0.5) & (v < height - 0.5)
-    return counts
-
-
-def rig_middle(rig: Rig) -> Float64[np.ndarray, " 3"]:
-    """The point nearest to all optical axes, in the least squares sense; where it is not determined, that nearest to
-    the cameras' mean."""
-    axes = rig.T_camera_world[:, 2, :3]
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    start = rig.centres.mean(axis=0)
-    away = np.einsum("cab,cb->a", across, rig.centres - start)
-    return start + np.linalg.pinv(across.sum(axis=0), rcond=1e-6) @ away
-
-
-def _best_share(rig: Rig, points: np.ndarray) -> float:
-    """Share of the cameras that would see the points, moved about the middle of the rig: the best of a few places."""
-    few = points[:: max(1, len(points) // RIG_SAMPLES)]
-    home = (rig_middle(rig) - few.mean(axis=0)) * (1, 0, 1)
-    steps = (-RIG_STEP_M, 0.0, RIG_STEP_M)
-    shares = [camera_counts(rig, few + home + (x, 0.0, z)).mean() for x in steps for z in steps]
-    return float(max(shares) / max(len(rig.names), 1))
-
-
-# --- colours -----------------------------------------------------------------------------------------------------
-
-
-def colour_statistics(scan: Scan, labels: UInt8[np.ndarray, " verts"], paints: Paints) -> ColourStatistics:
-    """Colours of a scan, against what its take promises.
-
-    Args:
-        labels: of the vertices, as `classify_colours` gives them; all 0 where the garment's colour is not known.
-    """
-    lab = to_lab(scan.colours)
-    chroma = np.hypot(lab[:, 1], lab[:, 2])
-    garment_chroma = spread = float("nan")
-    if paints.garment is not None:
-        wanted = to_lab(np.array([paints.garment], np.uint8))[0]
-        turn = np.angle((lab[:, 1] + 1j * lab[:, 2]) * (wanted[1] - 1j * wanted[2]))
-        own = (np.abs(turn) < np.radians(WEDGE_DEG)) & (chroma > 2)
-        if own.mean() > 0.01:
-            garment_chroma = float(np.percentile(chroma[own], 99))
-        if (labels == GARMENT).mean() > 0.01:
-            spread = float(np.percentile(colour_angles(scan.colours[labels == GARMENT], paints.garment), 95))
-    count = max(len(labels), 1)
-    borders = tuple(float((labels == FIRST_PAINT + i).sum() / count) for i in range(len(paints.borders)))
-    return ColourStatistics(
-        chroma=float(np.percentile(chroma, 99)) if len(chroma) else 0.0,
-        clipped=float((scan.colours >= 250).all(axis=1).mean()) if len(chroma) else 0.0,
-        garment=float((labels == GARMENT).mean()),
-        garment_chroma=garment_chroma,
-        garment_spread=spread,
-        borders=borders,
-        stray=_stray_shares(scan.mesh, labels, len(paints.borders)),
-    )
-
-
-def _labels(colours: np.ndarray, paints: Paints) -> np.ndarray:
-    if paints.garment is None:
-        return np.zeros(len(colours), np.uint8)
-    return classify_colours(colours, paints.garment, paints.borders)
-
-
-def _stray_shares(mesh: Mesh, labels: np.ndarray, paints: int) -> tuple[float, ...]:
-    """Of each paint, how much lies too far from cloth to be its border."""
-    cloth = mesh.vertices[labels == GARMENT]
-    if not len(cloth):
-        return (0.0,) * paints
-    tree = KDTree(cloth[:: max(1, len(cloth) // 20_000)], balanced_tree=False, compact_nodes=False)
-    shares = []
-    for paint in range(FIRST_PAINT, FIRST_PAINT + paints):
-        points = mesh.vertices[labels == paint]
-        points = points[:: max(1, len(points) // 2000)]
-        far = tree.query(points, distance_upper_bound=STRAY_DISTANCE_M)[0] if len(points) else np.zeros(0)
-        shares.append(float(np.isinf(far).mean()) if len(far) else 0.0)
-    return tuple(shares)

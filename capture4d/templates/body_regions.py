@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Literal, assert_never
+from typing import assert_never
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64
@@ -16,11 +16,10 @@ from jaxtyping import Bool, Float, Float64
 from capture4d.body.skinning import ShapedBody
 from capture4d.errors import InputError
 from capture4d.geometry.mesh import connected_components, submesh
+from capture4d.templates.config import Region
 from capture4d.types import Mesh
 
-__all__ = ["Region", "body_region"]
-
-Region = Literal["tshirt", "longsleeve", "trousers", "shorts"]
+__all__ = ["body_region"]
 
 JOINTS: dict[str, tuple[str, ...]] = {
     "neck": (r"^neck01$", r"^neck$"),

@@ -10,7 +10,6 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32
@@ -21,11 +20,11 @@ from capture4d.body.skinning import PosedBody, unskin
 from capture4d.errors import InputError
 from capture4d.geometry.mesh import boundary_loops, edge_uses, half_edges, vertex_normals
 from capture4d.geometry.uv_atlas import UvReport, check_uv, fresh_uv
+from capture4d.templates.config import UvChoice
 from capture4d.types import Body, Garment, Mesh
 
-__all__ = ["TemplateReport", "UvChoice", "make_template", "name_loops", "weld"]
+__all__ = ["TemplateReport", "make_template", "name_loops", "weld"]
 
-UvChoice = Literal["auto", "keep", "fresh", "none"]
 FAR_M = 0.25
 """A garment whose vertices lie farther than this from the body, in the median, is not on it."""
 LEAST_SIZE_M = 0.05

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,58 +11,63 @@ from capture4d.body.anny import load_anny
 from capture4d.body.motion_files import read_motion
 from capture4d.body.skinning import PosedBody, pose_frame, with_pose, with_shape
 from capture4d.errors import InputError
+from capture4d.files.atomic import file_digest
 from capture4d.files.meshes import read_mesh
 from capture4d.files.records import load_body, save_garment
-from capture4d.templates.body_regions import Region, body_region
-from capture4d.templates.garment import TemplateReport, UvChoice, make_template, weld
+from capture4d.runs.stage import StageResult
+from capture4d.templates.body_regions import body_region
+from capture4d.templates.config import TEMPLATE, TemplateConfig
+from capture4d.templates.garment import TemplateReport, make_template, weld
 from capture4d.types import Body, Garment
-from capture4d.units import METRES, Units
+from capture4d.units import METRES
 
-__all__ = ["run"]
+__all__ = ["TemplateResult", "run"]
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class TemplateResult(StageResult):
+    """A template that was written, and what was found on the way."""
+
+    garment: Garment
+    report: TemplateReport
 
 
 def run(
     mesh: Path | None,
     output: Path,
+    config: TemplateConfig = TEMPLATE,
     *,
     body: Path | None = None,
     poses: Path | None = None,
-    frame: int | None = None,
-    region: Region | None = None,
-    uv: UvChoice = "auto",
-    names: Sequence[str] = (),
-    units: Units = "m",
-) -> tuple[Garment, TemplateReport]:
-    """Write a template.
+) -> TemplateResult:
+    """Write a template. It is one file and takes seconds: there is nothing to resume, and no record of it.
 
     Args:
-        mesh: garment mesh on the body; None with a `region`.
+        mesh: garment mesh on the body; None with `config.region`.
+        output: template.npz; replaced if it is there.
         body: body.npz; the built-in one if None.
         poses: motion file that holds the pose and the shape in which the garment lies on the body; None is the rest
             pose of the mean shape.
-        frame: frame of `poses`, by its number; the first if None.
-        region: part of the body to take as the garment instead of a mesh.
     Raises:
         InputError: a file is missing or damaged, or the mesh cannot be a template.
     """
     if output.suffix.lower() != ".npz":
-        raise InputError(f"{output}: expected a template file .npz, found '{output.suffix}'")
-    if (mesh is None) == (region is None):
+        raise InputError(f"expected a template file .npz, found '{output.suffix}'", where=output)
+    if (mesh is None) == (config.region is None):
         raise InputError(f"template: expected a mesh or --region, found {'neither' if mesh is None else 'both'}")
     wearer = load_body(body) if body else load_anny()
-    posed = _posed(wearer, poses, frame)
+    posed = _posed(wearer, poses, config.pose_frame)
     if mesh is None:
-        assert region is not None
-        shape = posed.shaped.shape
-        posed = _at_rest(wearer, shape)
-        surface, source = body_region(posed.shaped, region), f"region {region}"
+        assert config.region is not None
+        posed = _at_rest(wearer, posed.shaped.shape)
+        surface, source = body_region(posed.shaped, config.region), f"region {config.region}"
     else:
         surface, source = read_mesh(mesh).mesh, str(mesh)
-        surface = surface.with_vertices(surface.vertices * np.float32(METRES[units]))
+        surface = surface.with_vertices(surface.vertices * np.float32(METRES[config.mesh_units]))
         surface = weld(surface) if mesh.suffix.lower() == ".glb" else surface
-    garment, report = make_template(surface, posed, uv=uv, names=names, source=source)
+    garment, report = make_template(surface, posed, uv=config.uv, names=config.loop_names, source=source)
     save_garment(output, garment)
-    return garment, report
+    return TemplateResult(output, file_digest([output], root=output.parent), garment=garment, report=report)
 
 
 def _posed(body: Body, poses: Path | None, frame: int | None) -> PosedBody:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, Literal
 
-from capture4d.preflight.stage import Checked
-from capture4d.preflight.verdict import Verdict
+from capture4d.preflight.check import Checked
+from capture4d.preflight.findings import Verdict
 
 __all__ = ["as_json", "print_table", "status"]
 
@@ -27,7 +26,7 @@ def status(verdict: Verdict) -> Status:
     return "errors" if any(finding.severity == "error" for finding in verdict.findings) else "warnings"
 
 
-def as_json(checked: Checked, *, fixed: Path | None = None) -> dict[str, Any]:
+def as_json(checked: Checked) -> dict[str, Any]:
     """The verdict for machines; docs/reference/findings.md describes it."""
     return {
         "format": 1,
@@ -48,7 +47,7 @@ def as_json(checked: Checked, *, fixed: Path | None = None) -> dict[str, Any]:
             for finding in checked.verdict.findings
         ],
         "scores": {code: round(score, 3) for code, score in checked.verdict.scores.items()},
-        "fixed": None if fixed is None else str(fixed),
+        "fixed": None if checked.fixed is None else str(checked.fixed),
     }
 
 

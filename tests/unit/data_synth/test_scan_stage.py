@@ -1,4 +1,5 @@
 import dataclasses
+import pickle
 import shutil
 
 import numpy as np
@@ -190,6 +191,16 @@ def test_an_npz_is_unpacked_once(tmp_path, monkeypatch):
     monkeypatch.setattr(np, "load", None)
     for frame_id in sequence.frame_ids:
         np.testing.assert_array_equal(sequence.read(frame_id).vertices, mesh.vertices)
+
+
+def test_worker_processes_scan_as_one_does(tmp_path):
+    """Each reads the sequence itself, whatever its kind: only its path travels."""
+    mesh = skirt()
+    np.savez(tmp_path / "sequence.npz", vertices=np.stack([mesh.vertices] * 3), faces=mesh.faces)
+    sequence = open_sequence(tmp_path / "sequence.npz")
+    assert len(pickle.dumps(sequence)) < mesh.vertices.nbytes
+    first, second = (run(tmp_path / "sequence.npz", tmp_path / str(n), SMALL, workers=n).digest for n in (1, 2))
+    assert first == second
 
 
 def test_meshes_that_have_changed_are_read_again(tmp_path):

@@ -8,7 +8,7 @@ import pytest
 from capture4d.geometry.mesh import boundary_edges, connected_components, vertex_normals
 from capture4d.geometry.mesh_kernels import face_components, laplacian_pass, open_vertices
 from capture4d.types import Mesh
-from registration.correspondences import match, match_both_ways, mesh_normals, prepare_scan
+from registration.correspondences import Gates, match, match_both_ways, mesh_normals, prepare_scan
 
 
 @pytest.fixture
@@ -70,7 +70,7 @@ def test_gates() -> None:
     surface = prepare_scan(plane.vertices, plane.faces, smoothing_passes=0)
     points = np.array([[0, 0, 0.01], [0, 0, 0.01], [0, 0, 0.5]])
     normals = np.array([[0, 0, 1.0], [0, 0, -1.0], [0, 0, 1.0]])
-    found = match(surface, points, normals, gate=0.1, min_normal_cosine=0.4, robust_scale=0.5)
+    found = match(surface, points, normals, Gates(0.1, normal_cosine=0.4, robust_scale=0.5))
     assert found.weights[0] == pytest.approx((1 + (0.01 / 0.05) ** 2) ** -2)
     np.testing.assert_array_equal(found.weights[1:], 0)
 
@@ -84,7 +84,7 @@ def test_the_layer_that_looks_the_right_way_is_matched(tube: Callable[[int, int]
     faces = np.concatenate([mesh.faces, mesh.faces[:, ::-1] + count]).astype(np.int32)
     surface = prepare_scan(np.concatenate([mesh.vertices, inner]), faces, smoothing_passes=0)
     points = (mesh.vertices - 0.0015 * outward).astype(float)
-    found = match(surface, points, outward.astype(float), gate=0.05, min_normal_cosine=0.4, robust_scale=1.0)
+    found = match(surface, points, outward.astype(float), Gates(0.05, normal_cosine=0.4, robust_scale=1.0))
     assert (found.weights > 0).all()
     assert (np.einsum("va,va->v", found.normals, outward) > 0).all()
 
@@ -95,8 +95,8 @@ def test_scan_beyond_the_edge_pulls_only_if_it_has_a_vote(tube: Callable[[int, i
     surface = prepare_scan(scan.vertices, scan.faces, smoothing_passes=0)
     normals = mesh_normals(low, template.faces)
     top = low[:, 1] > 0.39
-    options = {"gate": 0.3, "min_normal_cosine": 0.0, "robust_scale": 1.0}
-    one_way = match(surface, low, normals, **options)
-    both = match_both_ways(surface, low, normals, **options, neighbours=3, max_points=5000, normal_length=0.05)
+    gates = Gates(0.3, normal_cosine=0.0, robust_scale=1.0)
+    one_way = match(surface, low, normals, gates)
+    both = match_both_ways(surface, low, normals, gates, neighbours=3, max_points=5000, normal_length=0.05)
     assert (one_way.points - low)[top, 1].mean() < 0.01
     assert (both.points - low)[top, 1].mean() > 0.02

@@ -13,7 +13,7 @@ from benchmarks.simulated_views import calibration_rig
 from capture4d.calibration import stage as calibration_stage
 from capture4d.calibration.adjustment import RigEstimate
 from capture4d.calibration.report import rig_difference
-from capture4d.calibration.stage import find_images
+from capture4d.calibration.stage import find_images, read_covariance
 from capture4d.cameras.board import parse_board
 from capture4d.cameras.projection import rotation_from_vector
 from capture4d.errors import InputError
@@ -107,6 +107,52 @@ def test_corners_are_detected_once(shoot, tmp_path: Path, monkeypatch: pytest.Mo
     np.testing.assert_allclose(first, second, atol=1e-7)
 
 
+def test_what_is_calibrated_is_not_calibrated_again(shoot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Until its images or its files change."""
+    folder, _, _ = shoot
+    images = shutil.copytree(folder / "images", tmp_path / "images")
+    for path in folder.iterdir():
+        if path.is_file():
+            shutil.copy(path, tmp_path / path.name)
+    rig, calls = tmp_path / "rig.json", []
+    solve = calibration_stage.calibrate_rig
+    monkeypatch.setattr(calibration_stage, "calibrate_rig", lambda *a, **k: calls.append(1) or solve(*a, **k))
+    before, record = rig.read_bytes(), json.loads((tmp_path / "calibration_stage.json").read_text())
+    assert record["stage"] == "calibrate"
+    assert record["status"] == "complete"
+    assert run(*calibrate(images, rig, "--colmap", tmp_path / "model")) == 0
+    assert calls == []
+    assert rig.read_bytes() == before
+    assert (tmp_path / "model").is_dir()
+    save_rig(rig, replace(load_rig(rig), distortion=np.zeros((CAMERAS, 5))))
+    assert run(*calibrate(images, rig)) == 0
+    assert calls == [1]
+    assert rig.read_bytes() == before
+    (images / "cam00" / "008.png").unlink()
+    assert run(*calibrate(images, rig)) == 0
+    assert calls == [1, 1]
+    assert rig.read_bytes() != before
+
+
+def test_a_rig_of_other_settings_is_not_replaced_unasked(shoot, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    folder, _, _ = shoot
+    for path in folder.iterdir():
+        if path.is_file():
+            shutil.copy(path, tmp_path / path.name)
+    rig, before = tmp_path / "rig.json", (folder / "rig.json").read_bytes()
+    other = ("--hold-out", "0", "--no-flatness")
+    said = fails(capsys, *calibrate(folder / "images", rig, *other))
+    assert said == (
+        f"{tmp_path / 'calibration_stage.json'}: was made with other settings "
+        "(config.hold_out: was 0.15, now 0.0; config.flatness: was true, now false); use --overwrite"
+    )
+    assert rig.read_bytes() == before
+    assert run(*calibrate(folder / "images", rig, *other, "--overwrite")) == 0
+    assert json.loads((tmp_path / "calibration.json").read_text())["config"]["hold_out"] == 0
+    (tmp_path / "calibration_stage.json").unlink()
+    assert run(*calibrate(folder / "images", rig, *other)) == 0, "a rig without a record is replaced, as ever"
+
+
 def test_an_image_that_cannot_be_read_does_not_cost_those_that_can(
     shoot, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
@@ -134,11 +180,8 @@ def test_what_lies_beside_another_rig_is_not_used(shoot, tmp_path: Path, capsys:
     save_rig(tmp_path / "rig.json", replace(other, T_camera_world=other.T_camera_world + 1e-9))
     said = fails(capsys, "check-rig", tmp_path / "rig.json", folder / "still")
     assert said.endswith("calibration.json is of another rig.json")
-    digest = calibration_stage._rig_digest(tmp_path / "rig.json")
-    assert calibration_stage._read_covariance(tmp_path / "calibration_covariance.npz", digest, cameras=CAMERAS) is None
-    digest = calibration_stage._rig_digest(folder / "rig.json")
-    found = calibration_stage._read_covariance(tmp_path / "calibration_covariance.npz", digest, cameras=CAMERAS)
-    assert found is not None
+    assert read_covariance(tmp_path / "rig.json", cameras=CAMERAS) is None
+    assert read_covariance(folder / "rig.json", cameras=CAMERAS) is not None
 
 
 def test_a_rig_is_not_written_over_a_file_that_was_meant_for_a_folder(

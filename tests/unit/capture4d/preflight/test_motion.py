@@ -9,8 +9,9 @@ import pytest
 
 from capture4d.body.anny import load_anny
 from capture4d.body.posed_surface import BodyState, TrackedBody, pose_surface, tracked_body
+from capture4d.preflight.mannequin import UNIT_NORMALS, sample_surface
 from capture4d.preflight.motion import Motion, fit_person, floor_by_poses
-from capture4d.preflight.survey import UNIT_NORMALS, sample_surface, survey_take
+from capture4d.preflight.survey import survey_take
 from capture4d.types import Mesh
 
 PERSON = np.array([0.5, -0.5, 0.3, 0, 0, 0, 0, 0, 0, 0])

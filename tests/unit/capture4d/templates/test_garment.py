@@ -17,7 +17,8 @@ from capture4d.files.meshes import write_mesh
 from capture4d.files.records import load_garment, save_body, save_poses
 from capture4d.geometry.mesh import boundary_loops, unique_edges
 from capture4d.geometry.uv_atlas import check_uv, fresh_uv
-from capture4d.templates.body_regions import Region, body_region
+from capture4d.templates.body_regions import body_region
+from capture4d.templates.config import Region, TemplateConfig
 from capture4d.templates.garment import make_template, weld
 from capture4d.templates.stage import run
 from capture4d.types import Mesh
@@ -39,7 +40,9 @@ def person() -> ShapedBody:
 
 @pytest.mark.parametrize("region", get_args(Region))
 def test_a_region_is_a_template_with_its_borders_named(tmp_path: Path, region) -> None:
-    garment, report = run(None, tmp_path / "template.npz", region=region)
+    result = run(None, tmp_path / "template.npz", TemplateConfig(region=region))
+    garment, report = result.garment, result.report
+    assert result.path == tmp_path / "template.npz"
     assert set(garment.loops) == LOOPS[region]
     assert report.distance_m < 1e-5
     assert check_uv(garment.template).faults() == ()
@@ -68,17 +71,17 @@ def test_a_posed_mesh_in_centimetres_comes_back_to_the_rest_pose(tmp_path: Path,
     write_mesh(tmp_path / "shirt.obj", Mesh((100 * on_body).astype(np.float32), garment.template.faces))
     save_body(tmp_path / "body.npz", person.body)
     save_poses(tmp_path / "poses.npz", replace(poses, frame_ids=poses.frame_ids + np.int32(100)))
-    found, report = run(
-        tmp_path / "shirt.obj", tmp_path / "template.npz", body=tmp_path / "body.npz", poses=tmp_path / "poses.npz",
-        frame=125, units="cm",
-    )  # fmt: skip
+    config = TemplateConfig(pose_frame=125, mesh_units="cm")
+    output, body, motion = (tmp_path / name for name in ("template.npz", "body.npz", "poses.npz"))
+    result = run(tmp_path / "shirt.obj", output, config, body=body, poses=motion)
+    found, report = result.garment, result.report
     apart = np.linalg.norm(found.template.vertices - garment.template.vertices, axis=1)
     assert apart.mean() < 0.004
     assert report.distance_m < 1e-4
     assert set(found.loops) == LOOPS["tshirt"]
     np.testing.assert_array_equal(found.body_shape, SHAPE)
     with pytest.raises(InputError, match=r"expected a pose for frame 7, found frames 100 to 139"):
-        run(tmp_path / "shirt.obj", tmp_path / "t.npz", poses=tmp_path / "poses.npz", frame=7)
+        run(tmp_path / "shirt.obj", tmp_path / "t.npz", TemplateConfig(pose_frame=7), poses=motion)
 
 
 def test_seams_of_a_glb_are_sewn_up(tmp_path: Path, person: ShapedBody) -> None:
@@ -91,7 +94,7 @@ def test_seams_of_a_glb_are_sewn_up(tmp_path: Path, person: ShapedBody) -> None:
     assert len(unique_edges(sewn.faces)) == len(unique_edges(mesh.faces))
     np.testing.assert_array_equal(sewn.vertices[sewn.faces], mesh.vertices[mesh.faces])
     write_mesh(tmp_path / "shorts.glb", split)
-    garment, _ = run(tmp_path / "shorts.glb", tmp_path / "template.npz")
+    garment = run(tmp_path / "shorts.glb", tmp_path / "template.npz").garment
     assert set(garment.loops) == LOOPS["shorts"]
 
 

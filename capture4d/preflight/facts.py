@@ -1,0 +1,49 @@
+"""What a take says about itself, and what its file names say: claims that measuring the scans may refute."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from capture4d.colours.spaces import Colour
+
+__all__ = ["BadFrame", "Paints", "TakeFacts"]
+
+
+@dataclass(frozen=True, slots=True)
+class Paints:
+    """Colours that the take's description promises."""
+
+    garment: Colour | None = None
+    borders: tuple[Colour, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class BadFrame:
+    """A frame that cannot be looked at."""
+
+    frame_id: int
+    code: Literal["frame-unreadable", "frame-empty", "frame-nan"]
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TakeFacts:
+    """What a take says about itself, and what its file names say."""
+
+    fps: float | None
+    declared: float
+    """Metres in a unit of the scan files."""
+    paints: Paints = field(default_factory=Paints)
+    border_names: tuple[tuple[str, ...], ...] = ()
+    """Names of the borders of each paint."""
+    frame_ids: tuple[int, ...] = ()
+    """All frame numbers with a file, ascending."""
+    listed: tuple[int, ...] | None = None
+    """Frames that the description names."""
+    dropped: tuple[int, ...] = ()
+    """Frames that the description says were left out."""
+    duplicated: tuple[int, ...] = ()
+    """Frame numbers with more than one file."""
+    pose_frames: tuple[int, ...] | None = None
+    pose_fps: float | None = None

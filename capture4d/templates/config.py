@@ -1,0 +1,32 @@
+"""Settings of templates; the standard library alone, for the command line's sake."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from capture4d.settings import Whole, settings
+from capture4d.units import Units
+
+__all__ = ["TEMPLATE", "Region", "TemplateConfig", "UvChoice"]
+
+Region = Literal["tshirt", "longsleeve", "trousers", "shorts"]
+UvChoice = Literal["auto", "keep", "fresh", "none"]
+
+
+@settings
+class TemplateConfig:
+    """What becomes of a garment mesh, or of which part of the body a template is made."""
+
+    pose_frame: Whole | None = None
+    """Frame of the motion file in which the garment lies on the body, by its number; the first if None."""
+    region: Region | None = None
+    """Part of the body to take as the garment, instead of a mesh."""
+    uv: UvChoice = "auto"
+    """Keep the mesh's UVs or cut fresh ones; `auto` keeps them if nothing is wrong with them."""
+    loop_names: tuple[str, ...] = ()
+    """Names of the border loops, the one with the most vertices first; found by their place if empty."""
+    mesh_units: Units = "m"
+    """Of the mesh."""
+
+
+TEMPLATE = TemplateConfig()
