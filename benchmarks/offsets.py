@@ -24,11 +24,12 @@ from capture4d.captures.work_folder import load_moving_body, load_records, load_
 from capture4d.errors import InputError
 from capture4d.learning.networks import ImageDecoder
 from retarget.shapes.pose_normalisation import PoseRows
+from wrinkles.offset_images.config import OffsetTrainingConfig
 from wrinkles.offset_images.layout import OffsetLayout, OffsetSampler
 from wrinkles.offset_images.networks import FullyConnected, PcaFullyConnected
 from wrinkles.offset_images.training import (
-    OffsetConfig,
     OffsetFrames,
+    OffsetLesson,
     offset_frames,
     pose_joints,
     predict,
@@ -102,7 +103,7 @@ def run(
     networks = {
         "decoder": ImageDecoder(pose_size, channels=384 if size == 256 else 32, doublings=doublings),
         "fc": FullyConnected(pose_size, len(layout.vertex)),
-        "fc_pca": PcaFullyConnected(pose_size, learned.offsets, components=components),
+        "fc_pca": PcaFullyConnected.analysed(pose_size, learned.offsets, components=components),
     }
     lengths = {"decoder": epochs, "fc": baseline_epochs, "fc_pca": baseline_epochs}
     errors = {
@@ -152,7 +153,8 @@ def _errors(
     tested: OffsetFrames,
     epochs: int,
 ) -> _Errors:
-    train_offsets(network, layout, learned, validation, OffsetConfig(epochs=epochs, batch=min(16, len(learned))))
+    config = OffsetTrainingConfig(epochs=epochs, batch=min(16, len(learned)))
+    train_offsets(network, OffsetLesson(layout, learned, validation), config)
     sampler = OffsetSampler(layout)
     return _Errors(
         vertex_errors_cm(predict(network, sampler, learned), learned.vertices),

@@ -37,9 +37,10 @@ from benchmarks.learning_takes import learned_takes, registered_takes, training_
 from benchmarks.metric import Metric
 from benchmarks.renewal import renew
 from capture4d.body.skinning import with_shape
-from capture4d.captures.work_folder import load_registration, open_work
+from capture4d.captures.work_folder import open_work
 from capture4d.errors import InputError
 from capture4d.files.records import save_body, save_poses
+from capture4d.types import Mesh
 from retarget.animation.garment_model import load_garment_model
 from retarget.animation.stage import Wearer, run_on_coefficients
 from retarget.animation.stage import run as animate
@@ -58,11 +59,11 @@ from wrinkles.normal_maps.config import (
     WrinkleConfig,
 )
 from wrinkles.normal_maps.inference import WrinkleModel, load_model
+from wrinkles.normal_maps.maps_stage import ensure_pairs
+from wrinkles.normal_maps.maps_stage import run as make_pairs
 from wrinkles.normal_maps.metrics import MapScores
 from wrinkles.normal_maps.networks import UNet
-from wrinkles.normal_maps.pair_files import load_pairs, pair_template
-from wrinkles.normal_maps.pair_stage import ensure_pairs
-from wrinkles.normal_maps.pair_stage import run as make_pairs
+from wrinkles.normal_maps.pair_files import open_pairs
 from wrinkles.normal_maps.pairs import fitted
 from wrinkles.normal_maps.train_stage import run as train_network
 from wrinkles.normal_maps.train_stage import score_take
@@ -138,9 +139,9 @@ def run(
     plan = _quick_plan(workers) if quick else _plan(train, like, unlike, seeds, cell_steps, workers)
     for work in plan.clips.all:
         if train:
-            ensure_pairs(work, plan.clips.pairs, workers=workers)
+            ensure_pairs(open_work(work), plan.clips.pairs, workers=workers)
         else:
-            renew(partial(make_pairs, work, plan.clips.pairs, workers=workers))
+            renew(partial(make_pairs, open_work(work), plan.clips.pairs, workers=workers))
     with tempfile.TemporaryDirectory() as scratch:
         measured = _measure(plan, keep or Path(scratch), workers)
     for kind, found in measured.flickers.items():
@@ -291,8 +292,8 @@ def _answers(
     captured, config = known.person(), AnimateConfig(removal=RemovalConfig(enabled=False))
     placed: dict[Path, dict[str, Path]] = {}
     for work in clips.all:
-        sequence = load_registration(work / "registration")
-        body, poses = open_work(work).require_posed_body()
+        taken = open_work(work)
+        sequence, (body, poses) = taken.registered, taken.require_posed_body()
         rows = PoseRows.match(sequence, with_shape(body, poses.shape), poses)
         unposed = unpose_sequence(sequence, rows, captured.shape, unseen_weight=shape.unseen_weight)
         frames, weights = (np.stack(each) for each in zip(*unposed, strict=True))
@@ -308,7 +309,7 @@ def _answers(
                 animate(model_folder, motion, output, config, wearer=wearer, workers=workers)
             else:
                 run_on_coefficients(model_folder, motion, own[name], output, config, wearer=wearer, workers=workers)
-            make_pairs(output, clips.pairs, high_from=work)
+            make_pairs(open_work(output), clips.pairs, high_from=taken)
             placed.setdefault(work, {})[name] = output
 
     def shown(name: str) -> _Clips:
@@ -321,14 +322,15 @@ def _answers(
 
 def _trained(clips: _Clips, config: WrinkleConfig, output: Path, workers: int) -> WrinkleModel:
     Console(stderr=True).print(f"{output.name}: {config.schedule.steps} steps", highlight=False)
-    train_network(clips.train, output, config, workers=workers)
+    train_network([open_work(work) for work in clips.train], output, config, workers=workers)
     return load_model(output / "generator.safetensors")
 
 
 def _scored(model: WrinkleModel, works: Sequence[Path]) -> _Result:
     made, low = [], []
     for work in works:
-        scores = score_take(model, fitted(load_pairs(work), model.texels), pair_template(work))
+        pairs = open_pairs(work)
+        scores = score_take(model, fitted(pairs.read(), model.texels), pairs.template)
         made.append(scores[0])
         low.append(scores[1])
     return _Result(_mean(made), _mean(low))
@@ -340,7 +342,7 @@ def _norm_evidence(model: WrinkleModel, works: Sequence[Path]) -> dict[str, floa
     for kind in ("running", "instance"):
         config = replace(model.config, norm_at_test=kind)
         twin = WrinkleModel(UNet(config), config, texels=model.texels, maps=model.maps,
-                            layout_digest=model.layout_digest, reference=model.reference)  # fmt: skip
+                            layout_digest=model.layout_digest, template=model.template)  # fmt: skip
         twin.generator.load_state_dict(model.generator.state_dict())
         errors[kind] = _scored(twin, works).made.normal_error_deg
     return errors
@@ -379,8 +381,8 @@ def _milliseconds(config: WrinkleConfig, repeats: int, threads: int) -> float:
     torch.set_num_threads(threads)
     network = UNet(config.network).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     maps = MapConfig()
-    nobody = np.zeros((0, 3), np.float32)
-    model = WrinkleModel(network, config.network, texels=config.texels, maps=maps, layout_digest="", reference=nobody)
+    nobody = Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
+    model = WrinkleModel(network, config.network, texels=config.texels, maps=maps, layout_digest="", template=nobody)
     low = torch.nn.functional.normalize(torch.randn(3, maps.size, maps.size), dim=0)
     times = []
     for _ in range(repeats + 1):

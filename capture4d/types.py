@@ -9,7 +9,7 @@ Validation lives in `__post_init__` and nowhere else: what a type holds can be r
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -223,6 +223,19 @@ class PoseSequence:
             span = f"frames {self.frame_ids[0]} to {self.frame_ids[-1]}" if len(self.frame_ids) else "no frames"
             raise InputError(f"expected a pose for frame {frame_id}, found {span}")
         return int(rows[0])
+
+    def of_frames(self, frame_ids: Int32[np.ndarray, " wanted"]) -> PoseSequence:
+        """The poses of these frames, in this order.
+
+        Raises:
+            InputError: a frame has none.
+        """
+        at = {int(frame_id): row for row, frame_id in enumerate(self.frame_ids)}
+        missing = [int(frame_id) for frame_id in frame_ids if int(frame_id) not in at]
+        if missing:
+            raise InputError(f"poses: expected one for every registered frame, found none for frame {missing[0]}")
+        rows = [at[int(frame_id)] for frame_id in frame_ids]
+        return replace(self, rotations=self.rotations[rows], translations=self.translations[rows], frame_ids=frame_ids)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -50,6 +50,8 @@ def run_demo(output: Path, *, workers: int, overwrite: bool = False) -> tuple[Pa
     from retarget.fit_stage import run as fit
     from wrinkles.normal_maps.config import PRESETS as WRINKLES
     from wrinkles.normal_maps.train_stage import run as train_wrinkles
+    from wrinkles.offset_images.config import OffsetConfig, OffsetTrainingConfig
+    from wrinkles.offset_images.stage import run as learn_offsets
 
     synthesise(output / "capture", PRESETS["demo"], workers=workers, overwrite=overwrite)
     _calibrate_demo(output / "capture" / "rig.json", output / "rig", workers=workers, overwrite=overwrite)
@@ -58,9 +60,11 @@ def run_demo(output: Path, *, workers: int, overwrite: bool = False) -> tuple[Pa
     fit([open_work(output)], output / "retarget", FitConfig(training=quick), workers=workers, overwrite=overwrite)
     network = WRINKLES["small"]
     network = replace(network, held_out=HELD_OUT, schedule=replace(network.schedule, steps=WRINKLE_STEPS))
-    train_wrinkles([output], output / "wrinkles" / "model", network, workers=workers, overwrite=overwrite)
-    small = CompareConfig(held_out=HELD_OUT, image_texels=128, epochs=60)
-    compare(output, output / "wrinkles" / "model", small, workers=workers, overwrite=overwrite)
+    train_wrinkles([open_work(output)], output / "wrinkles" / "model", network, workers=workers, overwrite=overwrite)
+    images = OffsetConfig(held_out=HELD_OUT, texels=128, training=OffsetTrainingConfig(epochs=60))
+    learn_offsets(open_work(output), output / "wrinkles" / "offsets", images, workers=workers, overwrite=overwrite)
+    shown = CompareConfig(held_out=HELD_OUT)
+    compare(open_work(output), output / "wrinkles" / "model", shown, workers=workers, overwrite=overwrite)
     report = pipeline.report(output, capture=output / "capture", workers=workers, overwrite=overwrite)
     animate(
         output / "retarget",

@@ -28,7 +28,7 @@ from capture4d.cli.files import ConvertBody, ConvertPoses, ConvertRig, RegisterM
 from capture4d.cli.models import Animate, Fit
 from capture4d.cli.stages import Extract, Register, Report, Run, Track
 from capture4d.cli.synthesis import Scan, Synth, SynthBoard
-from capture4d.cli.wrinkles import Compare, WrinklesApply, WrinklesMaps, WrinklesTrain
+from capture4d.cli.wrinkles import Compare, WrinklesApply, WrinklesMaps, WrinklesOffsets, WrinklesTrain
 from capture4d.errors import InputError
 from capture4d.settings import gathered_faults
 from data_synth import config as synth_config
@@ -67,6 +67,7 @@ COMMANDS: Mapping[str, Any] = {
     "wrinkles maps": WrinklesMaps,
     "wrinkles train": WrinklesTrain,
     "wrinkles apply": WrinklesApply,
+    "wrinkles offsets": WrinklesOffsets,
     "compare": Compare,
     "register-mesh": RegisterMesh,
     "calibrate": Calibrate,
@@ -198,7 +199,7 @@ def _value_of(option: str, arguments: list[str]) -> str | None:
 
 def _overview(group: str = "") -> str:
     lines = [
-        f"  {name:<15} {(command.__doc__ or '').splitlines()[0]}"
+        f"  {name:<16} {(command.__doc__ or '').splitlines()[0]}"
         for name, command in COMMANDS.items()
         if name.startswith(group)
     ]

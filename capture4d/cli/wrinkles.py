@@ -1,4 +1,4 @@
-"""The commands about wrinkles: `capture4d wrinkles maps`, `train`, `apply`."""
+"""The commands about wrinkles: `capture4d wrinkles maps`, `train`, `apply`, `offsets`, and `compare`."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from capture4d.cli.options import StageOptions, all_cores
 from capture4d.settings import Count
 from wrinkles.normal_maps import config as wrinkle_config
 from wrinkles.normal_maps.config import PairConfig, WrinkleConfig
+from wrinkles.offset_images.config import OffsetConfig
 
-__all__ = ["Compare", "WrinklesApply", "WrinklesMaps", "WrinklesTrain"]
+__all__ = ["Compare", "WrinklesApply", "WrinklesMaps", "WrinklesOffsets", "WrinklesTrain"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,9 +34,11 @@ class WrinklesMaps(StageOptions):
     config: Annotated[PairConfig, arg(name="")] = field(default_factory=PairConfig)
 
     def __call__(self) -> int:
-        from wrinkles.normal_maps.pair_stage import run
+        from capture4d.captures.work_folder import open_work
+        from wrinkles.normal_maps.maps_stage import run
 
-        run(self.work, self.config, high_from=self.high_from, workers=self.workers, overwrite=self.overwrite)
+        lender = None if self.high_from is None else open_work(self.high_from)
+        run(open_work(self.work), self.config, high_from=lender, workers=self.workers, overwrite=self.overwrite)
         print(f"maps: {self.work / 'wrinkles' / 'pairs'}")
         return GOOD
 
@@ -56,9 +59,11 @@ class WrinklesTrain(StageOptions):
     """Processes for the maps, threads for the training; equal numbers give equal weights."""
 
     def __call__(self) -> int:
+        from capture4d.captures.work_folder import open_work
         from wrinkles.normal_maps.train_stage import run
 
-        run(self.works, self.output, self.config, pairs=self.pairs, workers=self.workers, overwrite=self.overwrite)
+        works = [open_work(work) for work in self.works]
+        run(works, self.output, self.config, pairs=self.pairs, workers=self.workers, overwrite=self.overwrite)
         print(f"model: {self.output}")
         return GOOD
 
@@ -77,21 +82,43 @@ class WrinklesApply(StageOptions):
     """Per channel of the PNG files."""
 
     def __call__(self) -> int:
+        from capture4d.captures.work_folder import open_work
         from wrinkles.normal_maps.apply_stage import ApplyConfig, run
 
         settings = ApplyConfig(flip_green=self.flip_green, bits=self.bits)
-        run(self.model, self.work, settings, workers=self.workers, overwrite=self.overwrite)
+        run(self.model, open_work(self.work), settings, workers=self.workers, overwrite=self.overwrite)
         print(f"maps: {self.work / 'wrinkles' / 'generated' / 'frames'}")
+        return GOOD
+
+
+@dataclass(frozen=True, kw_only=True)
+class WrinklesOffsets(StageOptions):
+    """Learn offset images of a registered take from its poses, and a baseline without images; `compare` shows them."""
+
+    work: Annotated[Positional[Path], arg(metavar="WORK")]
+    """Work folder; holds registration/, gets wrinkles/offsets/."""
+    config: Annotated[OffsetConfig, arg(name="")] = field(default_factory=OffsetConfig)
+    workers: int = field(default_factory=all_cores)
+    """Threads for the training; equal numbers give equal weights."""
+
+    def __call__(self) -> int:
+        from capture4d.captures.work_folder import open_work
+        from wrinkles.offset_images.model_files import OFFSETS
+        from wrinkles.offset_images.stage import run
+
+        work, output = open_work(self.work), self.work / OFFSETS
+        learned = run(work, output, self.config, workers=self.workers, overwrite=self.overwrite)
+        print(f"offset images: {learned.path}")
         return GOOD
 
 
 @dataclass(frozen=True, kw_only=True)
 class Compare(StageOptions):
     """Compare registration, garment model, generated maps and offset images on the same held-out frames: one table, one
-    page."""
+    page. Learns nothing itself: `fit`, `wrinkles train` and `wrinkles offsets` do."""
 
     work: Annotated[Positional[Path], arg(metavar="WORK")]
-    """Work folder; holds garment/ and registration/, gets compare/."""
+    """Work folder; holds garment/, registration/ and perhaps wrinkles/offsets/, gets compare/."""
     model: Path
     """Model folder of `wrinkles train`."""
     garment_model: Path | None = None
@@ -100,14 +127,15 @@ class Compare(StageOptions):
 
     def __call__(self) -> int:
         from capture4d.app.compare.page import run
+        from capture4d.captures.work_folder import open_work
 
-        page = run(
-            self.work,
+        compared = run(
+            open_work(self.work),
             self.model,
             self.config,
             garment_model=self.garment_model,
             workers=self.workers,
             overwrite=self.overwrite,
         )
-        print(f"comparison: {page}")
+        print(f"comparison: {compared.path}")
         return GOOD

@@ -21,7 +21,7 @@ from typing import Any
 from capture4d.errors import InputError, StaleError
 from capture4d.files.atomic import TEMPORARY_SUFFIX, file_digest, plain_value, read_json, write_json
 
-__all__ = ["Stage", "StageResult", "differences", "open_stage", "require_complete", "result_of"]
+__all__ = ["Stage", "StageResult", "complete_record", "differences", "open_stage", "require_complete", "result_of"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,7 +181,19 @@ def require_complete(
     made_from: Mapping[str, str] | None = None,
     former_names: Sequence[str] = (),
 ) -> str:
-    """The digest of a finished stage.
+    """The digest of a finished stage; `complete_record` has the arguments."""
+    return complete_record(folder, name, command, made_from=made_from, former_names=former_names)["digest"]
+
+
+def complete_record(
+    folder: str | Path,
+    name: str,
+    command: str,
+    *,
+    made_from: Mapping[str, str] | None = None,
+    former_names: Sequence[str] = (),
+) -> Mapping[str, Any]:
+    """The stage.json of a finished stage: its `digest`, the `config` and the `upstream` it was made with.
 
     Args:
         made_from: digests of inputs that it has to have been made from, by name.
@@ -205,7 +217,7 @@ def require_complete(
                 f"state; run: {command} --overwrite",
                 where=folder,
             )
-    return record["digest"]
+    return record
 
 
 def differences(now: Any, before: Any, prefix: str = "") -> Iterator[str]:

@@ -51,20 +51,7 @@ class PoseRows:
                 f"poses: expected the body's {joints} joints, found {len(poses.joint_names)} in the poses and "
                 f"{weights.shape[1]} in the template's skin weights"
             )
-        at = {int(frame_id): row for row, frame_id in enumerate(poses.frame_ids)}
-        missing = [int(frame_id) for frame_id in frame_ids if int(frame_id) not in at]
-        if missing:
-            raise InputError(f"poses: expected one for every registered frame, found none for frame {missing[0]}")
-        rows = [at[int(frame_id)] for frame_id in frame_ids]
-        kept = PoseSequence(
-            poses.rotations[rows],
-            poses.translations[rows],
-            poses.shape,
-            frame_ids,
-            poses.fps,
-            poses.joint_names,
-        )
-        return PoseRows(shaped, kept)
+        return PoseRows(shaped, poses.of_frames(frame_ids))
 
     def transforms(self, row: int) -> Float64[np.ndarray, "joints 4 4"]:
         """Rest pose to world of a frame, per joint."""

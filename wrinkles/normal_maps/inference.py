@@ -4,27 +4,29 @@ from __future__ import annotations
 
 import copy
 from dataclasses import asdict
+from os import PathLike
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
 from capture4d.errors import InputError
 from capture4d.files.checkpoints import load_weights
 from capture4d.files.tensors import read_tensors, write_tensors
+from capture4d.types import Mesh
 from wrinkles.normal_maps.config import MapConfig, NetworkConfig
 from wrinkles.normal_maps.networks import UNet, set_test_statistics
 
-__all__ = ["WrinkleModel", "load_model", "save_model"]
+__all__ = ["WrinkleModel", "generator_path", "load_model", "save_model"]
 
 KIND = "a wrinkle generator"
 HALF_FROM = 32
 """Filters from which bfloat16 is faster on a CPU."""
-REFERENCE = "reference"
-"""Name of the template's vertices among the tensors."""
+VERTICES, FACES, UV = "reference", "faces", "uv"
+"""Names of the template's parts among the tensors."""
 
 
 class WrinkleModel:
@@ -38,7 +40,7 @@ class WrinkleModel:
         texels: int,
         maps: MapConfig,
         layout_digest: str,
-        reference: Float32[np.ndarray, "V 3"],
+        template: Mesh,
     ) -> None:
         self.generator = generator
         self.config = config
@@ -48,8 +50,9 @@ class WrinkleModel:
         """Of the maps on disk."""
         self.layout_digest = layout_digest
         """Of the UV layout; other layouts mean nothing to the generator."""
-        self.reference = reference
-        """The template's vertices to which garment coordinates refer."""
+        self.template = template
+        """Its vertices as garment coordinates refer to them, its UVs as the maps have them. Models of early versions
+        keep only the vertices."""
         set_test_statistics(generator, config.norm_at_test)
         self._narrow: UNet | None = None
 
@@ -105,30 +108,42 @@ def save_model(path: str | Path, model: WrinkleModel) -> None:
         "layout_digest": model.layout_digest,
     }
     weights = {name: tensor.numpy() for name, tensor in model.generator.state_dict().items()}
-    write_tensors(path, KIND, weights | {REFERENCE: model.reference}, about)
+    template = {VERTICES: model.template.vertices, FACES: model.template.faces}
+    if model.template.uv is not None:
+        template[UV] = model.template.uv
+    write_tensors(path, KIND, weights | template, about)
 
 
-def load_model(path: str | Path) -> WrinkleModel:
-    """Read a generator.
+def generator_path(model: str | PathLike[str]) -> Path:
+    """The generator in a folder of `wrinkles train`, or the file itself."""
+    path = Path(model)
+    return path / "generator.safetensors" if path.is_dir() else path
+
+
+def load_model(path: str | PathLike[str]) -> WrinkleModel:
+    """Read a generator: the folder that `wrinkles train` wrote, or the file in it.
 
     Raises:
         InputError: the file is missing, damaged, not a generator of ours, or its weights are not those of the
             architecture it claims.
     """
-    if not Path(path).is_file():
-        raise InputError(f"{path}: no such file; run: capture4d wrinkles train WORK --output MODEL")
+    path = generator_path(path)
+    if not path.is_file():
+        raise InputError("no such file; run: capture4d wrinkles train WORK --output MODEL", where=path)
     file = read_tensors(path, KIND)
     try:
         config, maps = NetworkConfig(**file.entry("network")), MapConfig(**file.entry("maps"))
     except (TypeError, ValueError) as error:
-        raise InputError(f"{path}: expected the settings of a wrinkle generator, found others ({error})") from None
+        raise InputError(f"expected the settings of a wrinkle generator, found others ({error})", where=path) from None
     with torch.device("meta"):
         generator = UNet(config)
     generator.to_empty(device="cpu")
-    reference = file[REFERENCE]
-    weights = {name: torch.from_numpy(each) for name, each in file.tensors.items() if name != REFERENCE}
+    faces = file.get(FACES)
+    template = Mesh(file[VERTICES], np.zeros((0, 3), np.int32) if faces is None else faces, file.get(UV))
+    own = (VERTICES, FACES, UV)
+    weights = {name: torch.from_numpy(each) for name, each in file.tensors.items() if name not in own}
     load_weights(generator, weights, source=path)
     return WrinkleModel(
         generator.to(memory_format=torch.channels_last),  # pyright: ignore[reportCallIssue]
-        config, texels=file.entry("texels"), maps=maps, layout_digest=file.entry("layout_digest"), reference=reference,
+        config, texels=file.entry("texels"), maps=maps, layout_digest=file.entry("layout_digest"), template=template,
     )  # fmt: skip

@@ -1,8 +1,9 @@
-"""Reading the pairs of a work folder into memory, and telling layouts apart."""
+"""The pairs of a work folder as a value, and telling layouts apart."""
 
 from __future__ import annotations
 
 import hashlib
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,16 +12,20 @@ from jaxtyping import Bool
 from torch.nn import functional
 
 from capture4d.errors import InputError
-from capture4d.files.atomic import read_json
 from capture4d.files.records import load_garment
 from capture4d.geometry.uv_raster import rasterise_uv
-from capture4d.runs.stage import require_complete
+from capture4d.runs.stage import complete_record
 from capture4d.types import Mesh
 from wrinkles.normal_maps.config import MapConfig
 from wrinkles.normal_maps.pairs import PairTake
 from wrinkles.normal_maps.spaces import decode_png
 
-__all__ = ["layout_digest", "load_pairs", "map_settings", "pair_template", "read_map", "surface_texels"]
+__all__ = ["FORMER_NAMES", "MAPS", "PAIRS", "PairFolder", "layout_digest", "open_pairs", "read_map", "surface_texels"]
+
+PAIRS = Path("wrinkles", "pairs")
+"""Where they lie in a work folder."""
+MAPS, FORMER_NAMES = "wrinkles maps", ("pairs",)
+"""The stage that makes them."""
 
 
 def layout_digest(mesh: Mesh, size: int) -> str:
@@ -28,17 +33,6 @@ def layout_digest(mesh: Mesh, size: int) -> str:
     assert mesh.uv is not None
     rounded = np.round(mesh.uv * 65536).astype(np.int32)
     return hashlib.sha256(mesh.faces.tobytes() + rounded.tobytes() + str(size).encode()).hexdigest()[:16]
-
-
-def pair_template(work: Path) -> Mesh:
-    """The template of a work folder's pairs: its UVs as the maps have them, its vertices as garment coordinates refer
-    to them."""
-    return load_garment(work / "wrinkles" / "pairs" / "template.npz").template
-
-
-def map_settings(work: Path) -> MapConfig:
-    """How a work folder's pairs lie in their images."""
-    return MapConfig(**read_json(work / "wrinkles" / "pairs" / "stage.json")["config"]["map"])
 
 
 def surface_texels(mesh: Mesh, size: int, texels: int) -> Bool[torch.Tensor, "1 texels texels"]:
@@ -52,34 +46,72 @@ def surface_texels(mesh: Mesh, size: int, texels: int) -> Bool[torch.Tensor, "1 
     return functional.avg_pool2d(inside, size // texels) >= 0.5
 
 
-def load_pairs(work: Path) -> PairTake:
-    """All pairs of a work folder.
+@dataclass(frozen=True, slots=True, eq=False)
+class PairFolder:
+    """The finished pairs of a work folder, opened once; the maps stay on disk until they are read."""
+
+    work: Path
+    digest: str
+    registration: str
+    """Digest of the registration they were made from."""
+    maps: MapConfig
+    """How they lie in their images."""
+    template: Mesh
+    """Its UVs as the maps have them, its vertices as garment coordinates refer to them."""
+
+    @property
+    def path(self) -> Path:
+        return self.work / PAIRS
+
+    @property
+    def layout_digest(self) -> str:
+        """What a network for these maps must have been trained on."""
+        return layout_digest(self.template, self.maps.size)
+
+    def read(self) -> PairTake:
+        """All pairs.
+
+        Raises:
+            InputError: there are none, or they are damaged or of different sizes.
+        """
+        paths = sorted(path for path in (self.path / "high").glob("*.png") if path.stem.isdigit())
+        low, high, valid = [], [], []
+        for path in paths:
+            lower, shown = read_map(self.path / "low" / path.name)
+            higher, known = read_map(path)
+            if higher.shape != lower.shape or lower.shape != (low[0].shape if low else lower.shape):
+                expected = " x ".join(str(side) for side in (low[0] if low else lower).shape[:2])
+                found = " x ".join(str(side) for side in higher.shape[:2])
+                raise InputError(f"expected a map and a mask of {expected} texels, found {found}", where=path)
+            low.append((lower * shown[..., None]).astype(np.float16))
+            high.append((higher * known[..., None]).astype(np.float16))
+            valid.append(known)
+        if not paths:
+            raise InputError("expected maps, found none", where=self.path / "high")
+        frame_ids = np.array([int(path.stem) for path in paths], np.int32)
+
+        def stacked(images: list[np.ndarray]) -> torch.Tensor:
+            return torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).contiguous()
+
+        masks = stacked([each[..., None] for each in valid])
+        return PairTake(self.work.name, frame_ids, stacked(low), stacked(high), masks)
+
+
+def open_pairs(work: Path) -> PairFolder:
+    """Open the pairs of a work folder.
 
     Raises:
-        InputError: they are missing, unfinished, or of different sizes.
+        InputError: they are missing or unfinished.
     """
-    folder = work / "wrinkles" / "pairs"
-    require_complete(folder, "pairs", f"capture4d wrinkles maps {work}")
-    paths = sorted(path for path in (folder / "high").glob("*.png") if path.stem.isdigit())
-    low, high, valid = [], [], []
-    for path in paths:
-        lower, shown = read_map(folder / "low" / path.name)
-        higher, known = read_map(path)
-        if higher.shape != lower.shape or lower.shape != (low[0].shape if low else lower.shape):
-            expected = " x ".join(str(side) for side in (low[0] if low else lower).shape[:2])
-            raise InputError(f"{path}: expected a map and a mask of {expected} texels, found "
-                             f"{' x '.join(str(side) for side in higher.shape[:2])}")  # fmt: skip
-        low.append((lower * shown[..., None]).astype(np.float16))
-        high.append((higher * known[..., None]).astype(np.float16))
-        valid.append(known)
-    if not paths:
-        raise InputError(f"{folder / 'high'}: expected maps, found none")
-    frame_ids = np.array([int(path.stem) for path in paths], np.int32)
-
-    def stacked(images: list[np.ndarray]) -> torch.Tensor:
-        return torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).contiguous()
-
-    return PairTake(work.name, frame_ids, stacked(low), stacked(high), stacked([each[..., None] for each in valid]))
+    folder = work / PAIRS
+    record = complete_record(folder, MAPS, f"capture4d wrinkles maps {work}", former_names=FORMER_NAMES)
+    return PairFolder(
+        work,
+        record["digest"],
+        record["upstream"]["registration"],
+        MapConfig(**record["config"]["map"]),
+        load_garment(folder / "template.npz").template,
+    )
 
 
 def read_map(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -91,4 +123,4 @@ def read_map(path: Path) -> tuple[np.ndarray, np.ndarray]:
     try:
         return decode_png(path.read_bytes(), source=str(path))
     except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
+        raise InputError("no such file", where=path) from None

@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from capture4d.errors import InputError
+from wrinkles.frame_split import split_rows
 from wrinkles.normal_maps.config import AugmentationConfig
 
 __all__ = ["Batch", "PairTake", "augmented", "batches", "consecutive_pairs", "fitted", "halved", "split"]
@@ -62,16 +63,9 @@ class Batch:
 
 
 def split(take: PairTake, *, held_out: float, gap: int) -> tuple[PairTake, PairTake]:
-    """The start of a take for training, and its end, some frames later, held out.
-
-    A tenth of a short take is gap enough, but at least two frames are: high maps share the scans of their neighbours.
-    """
-    count = len(take.frame_ids)
-    tail = max(round(held_out * count), 1) if held_out > 0 else 0
-    gap = min(gap, max(count // 10, 2)) if tail else 0
-    if count - tail - gap < 2:
-        raise InputError(f"{take.name}: expected at least 2 frames to train on, found {count - tail - gap}")
-    return take.part(range(count - tail - gap)), take.part(range(count - tail, count))
+    """The frames to learn from and those held out, as `split_rows` has them."""
+    learned, held = split_rows(len(take.frame_ids), held_out=held_out, gap=gap, name=take.name)
+    return take.part(learned), take.part(held)
 
 
 def fitted(take: PairTake, size: int) -> PairTake:

@@ -16,7 +16,7 @@ from capture4d.geometry.uv_raster import UvRaster, rasterise_uv
 from capture4d.types import Garment, Mesh
 from wrinkles.normal_maps.config import MapConfig, ProjectionConfig
 from wrinkles.normal_maps.scan_normals import TexelNormals, combine_frames, project_scan
-from wrinkles.normal_maps.spaces import garment_rotation
+from wrinkles.normal_maps.spaces import garment_rotation, to_tangent
 
 __all__ = ["FramePair", "MapTemplate", "frame_pairs", "temporal_window"]
 
@@ -40,9 +40,13 @@ class MapTemplate:
             InputError: the template has no UVs, or such as do not fit an image, or overlapping islands.
         """
         gap = (2 * config.padding + 2) / config.size
-        mesh = unit_square(garment.template, layout=config.layout, gap=gap)
-        raster = rasterise_uv(mesh, config.size, padding=config.padding)
+        return MapTemplate.laid_out(unit_square(garment.template, layout=config.layout, gap=gap), config)
+
+    @staticmethod
+    def laid_out(mesh: Mesh, config: MapConfig) -> MapTemplate:
+        """The same of a template whose UVs are those of the maps already."""
         assert mesh.uv is not None
+        raster = rasterise_uv(mesh, config.size, padding=config.padding)
         return MapTemplate(mesh, raster, TangentLayout(mesh.faces, mesh.uv), mesh.vertices)
 
     def referred_to(self, reference: Float32[np.ndarray, "V 3"]) -> MapTemplate:
@@ -57,6 +61,14 @@ class MapTemplate:
     def frames(self, vertices: Float[np.ndarray, "V 3"]) -> Float64[np.ndarray, "N 3 3"]:
         """Tangent frames per texel: rows tangent, bitangent, normal."""
         return tangent_frames(self.raster, self.tangents, vertices)
+
+    def tangent_image(
+        self, normals: Float[np.ndarray, "N 3"], frames: Float[np.ndarray, "N 3 3"]
+    ) -> Float[np.ndarray, "size size 3"]:
+        """The map in tangent space of world normals; flat, (0, 0, 1), where it shows nothing."""
+        image = self.raster.image(to_tangent(normals, frames))
+        image[~self.raster.image(np.ones(len(normals), bool))] = (0, 0, 1)
+        return image
 
     def rotation(self, vertices: Float[np.ndarray, "V 3"]) -> Float64[np.ndarray, "3 3"]:
         """World from garment coordinates; `normals @ rotation` are normals in garment coordinates."""

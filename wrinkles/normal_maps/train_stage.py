@@ -19,19 +19,19 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from capture4d.captures.work_folder import registered_digest
+from capture4d.captures.work_folder import WorkFolder
 from capture4d.errors import InputError
 from capture4d.files.atomic import read_json, read_json_lines, write_bytes, write_json
 from capture4d.geometry.uv_layout import millimetres_per_texel
-from capture4d.runs.stage import Stage, StageResult, open_stage, require_complete
+from capture4d.runs.stage import Stage, StageResult, open_stage
 from capture4d.runs.workers import progress
 from capture4d.types import Mesh
 from wrinkles.normal_maps.config import PairConfig, WrinkleConfig
 from wrinkles.normal_maps.inference import WrinkleModel, save_model
+from wrinkles.normal_maps.maps_stage import ensure_pairs
+from wrinkles.normal_maps.maps_stage import run as make_pairs
 from wrinkles.normal_maps.metrics import MapScores, score
-from wrinkles.normal_maps.pair_files import layout_digest, load_pairs, map_settings, pair_template, surface_texels
-from wrinkles.normal_maps.pair_stage import ensure_pairs
-from wrinkles.normal_maps.pair_stage import run as make_pairs
+from wrinkles.normal_maps.pair_files import PairFolder, open_pairs, surface_texels
 from wrinkles.normal_maps.pairs import PairTake, batches, consecutive_pairs, fitted, split
 from wrinkles.normal_maps.spaces import to_colours
 from wrinkles.normal_maps.training import TrainingState, load_state, new_state, save_state, train_step
@@ -45,7 +45,7 @@ SAMPLES = 4
 
 
 def run(
-    works: Sequence[Path],
+    works: Sequence[WorkFolder],
     output: Path,
     config: WrinkleConfig,
     *,
@@ -65,49 +65,49 @@ def run(
     """
     if not works:
         raise InputError("wrinkles train: expected at least one work folder, found none")
-    for work in works:
-        if pairs is None or pairs == PairConfig():
-            ensure_pairs(work, PairConfig(), workers=workers)
-        else:
-            make_pairs(work, pairs, workers=workers)
-    upstream = {
-        work.name: require_complete(work / "wrinkles" / "pairs", "pairs", f"capture4d wrinkles maps {work}")
-        for work in works
-    }
-    if len(upstream) < len(works):
+    if len({work.path.name for work in works}) < len(works):
         raise InputError("wrinkles train: expected work folders of different names, found two alike")
-    takes = [load_pairs(work) for work in works]
-    mesh, maps = pair_template(works[0]), map_settings(works[0])
-    digest = layout_digest(mesh, maps.size)
-    for work in works:
-        if layout_digest(pair_template(work), map_settings(work).size) != digest:
-            raise InputError(
-                f"{work}: expected the UV layout of {works[0]}, found another; one network needs one layout"
-            )
+    folders = [_pairs(work, pairs, workers=workers) for work in works]
+    first, *others = folders
+    for folder in others:
+        if folder.layout_digest != first.layout_digest:
+            raise InputError(f"expected the UV layout of {first.work}, found another; one network needs one layout",
+                             where=folder.work)  # fmt: skip
+    takes = [folder.read() for folder in folders]
     parts = [split(fitted(take, config.texels), held_out=config.held_out, gap=config.held_out_gap) for take in takes]
     consecutive_pairs([train for train, _ in parts])
     torch.set_num_threads(workers)
     state = new_state(config)
     stage = open_stage(
-        output, name="train-wrinkles", schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite
-    )
+        output, name="wrinkles train", former_names=("train-wrinkles",), schema=SCHEMA, config=config,
+        upstream={folder.work.name: folder.digest for folder in folders}, overwrite=overwrite,
+    )  # fmt: skip
     weights, measures = stage.path / "generator.safetensors", stage.path / "held_out.json"
     if stage.was_complete and weights.is_file() and measures.is_file():
         return stage.finish([weights], changed=False)
-    write_json(stage.path / TAKES, {work.name: registered_digest(work) for work in works})
+    write_json(stage.path / TAKES, {folder.work.name: folder.registration for folder in folders})
     recent = _resume(stage, state)
     _train(stage, state, recent, [train for train, _ in parts], [held for _, held in parts], config)
     model = WrinkleModel(
-        state.generator, config.network, texels=config.texels, maps=maps, layout_digest=digest, reference=mesh.vertices
-    )
+        state.generator, config.network, texels=config.texels, maps=first.maps, layout_digest=first.layout_digest,
+        template=first.template,
+    )  # fmt: skip
     save_model(weights, model)
     measured = {}
     for _, held in parts:
         if len(held.frame_ids):
-            made, low = score_take(model, held, mesh)
+            made, low = score_take(model, held, first.template)
             measured[held.name] = {"made": _json(made), "low": _json(low)}
     write_json(measures, measured)
     return stage.finish([weights])
+
+
+def _pairs(work: WorkFolder, config: PairConfig | None, *, workers: int) -> PairFolder:
+    """As they are if they are there, unless other settings than the default are asked for."""
+    if config is None or config == PairConfig():
+        return ensure_pairs(work, PairConfig(), workers=workers)
+    make_pairs(work, config, workers=workers)
+    return open_pairs(work.path)
 
 
 def learned_takes(model: Path) -> set[str]:

@@ -5,6 +5,7 @@ References: Jin et al., A pixel-based framework for data-driven clothing, SCA 20
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -16,45 +17,27 @@ from torch import Tensor, nn
 
 from capture4d.body.skinning import pose_frame, with_shape
 from capture4d.learning.networks import ImageDecoder
-from capture4d.settings import Count, NonNegative, Positive, Seed, settings
 from capture4d.types import Body, PoseSequence
+from wrinkles.offset_images.config import OffsetTrainingConfig
 from wrinkles.offset_images.layout import OffsetLayout, OffsetSampler, OffsetSpace, encode
 from wrinkles.offset_images.networks import FullyConnected
 
 __all__ = [
-    "OffsetConfig",
     "OffsetFrames",
+    "OffsetLesson",
+    "OffsetTraining",
     "grid_loss",
     "normal_loss",
     "offset_frames",
     "pose_joints",
     "predict",
+    "start_training",
+    "train_epoch",
     "train_offsets",
     "vertex_errors_cm",
 ]
 
 CM = 100.0
-
-
-@settings
-class OffsetConfig:
-    """How the decoder and its baselines learn. Adam at 1e-3; the paper does not say the rest."""
-
-    seed: Seed = 0
-    epochs: Count = 60
-    batch: Count = 16
-    learning_rate: Positive = 1e-3
-    """Falls to zero along a cosine."""
-    norm: Literal["l1", "l2"] = "l2"
-    """Of the three channels of a texel, in the grid loss; l2 is not squared."""
-    normal_weight: NonNegative = 0.01
-    patience: Count = 12
-    """Epochs without a better validation error after which training stops."""
-    centred: bool = True
-    """The decoder learns how images differ from their mean, and the baseline without PCA starts from the mean; the
-    paper says nothing of either."""
-    half_precision: bool = True
-    """Compute the decoder in bfloat16 where torch thinks it safe; its losses are not."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -186,51 +169,111 @@ def _start_from_mean(network: nn.Module, train: OffsetFrames, drawn: Tensor | No
                 last.bias.copy_(train.offsets.mean(dim=0).flatten())
 
 
-def train_offsets(
-    network: nn.Module, layout: OffsetLayout, train: OffsetFrames, validation: OffsetFrames, config: OffsetConfig
-) -> list[float]:
+@dataclass(frozen=True, slots=True, eq=False)
+class OffsetLesson:
+    """What networks learn from: frames, and those that choose the epoch."""
+
+    layout: OffsetLayout
+    train: OffsetFrames
+    validation: OffsetFrames
+
+
+@dataclass(slots=True, eq=False)
+class OffsetTraining:
+    """A network while it learns: everything an epoch changes, and what it needs of the lesson."""
+
+    network: nn.Module
+    best: nn.Module
+    """As the network was after the epoch with the least validation error."""
+    optimizer: torch.optim.Adam
+    schedule: torch.optim.lr_scheduler.CosineAnnealingLR
+    lesson: OffsetLesson
+    sampler: OffsetSampler
+    mask: Bool[Tensor, "2 size size"]
+    """Texels that count."""
+    drawn: Float16[Tensor, "frames 6 size size"] | None
+    """The images to learn, for the decoder."""
+    losses: list[float]
+    """Mean over an epoch's batches, of every epoch so far."""
+    errors: list[float]
+    """Validation error of every epoch so far, cm."""
+
+    def is_over(self, config: OffsetTrainingConfig) -> bool:
+        """All epochs are done, or the last ones brought nothing."""
+        done = len(self.errors)
+        return done >= config.epochs or (done > 0 and done - int(np.argmin(self.errors)) > config.patience)
+
+    def go_on_from(self, losses: Sequence[float], errors: Sequence[float]) -> None:
+        """Continue after so many epochs; network and optimiser are as they were then."""
+        self.losses, self.errors = list(losses), list(errors)
+        self.schedule.last_epoch = len(errors)  # the optimiser's rate is that of this epoch already
+
+
+def start_training(network: nn.Module, lesson: OffsetLesson, config: OffsetTrainingConfig) -> OffsetTraining:
+    """Make a network that has learned nothing ready for its first epoch; seeds torch's generator."""
+    torch.manual_seed(config.seed)
+    drawn = _drawn(lesson.layout, lesson.train) if isinstance(network, ImageDecoder) else None
+    if drawn is not None:
+        network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+        drawn = drawn.contiguous(memory_format=torch.channels_last)
+    if config.centred:
+        _start_from_mean(network, lesson.train, drawn)
+    optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate)
+    falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, config.epochs)
+    mask = torch.from_numpy(lesson.layout.mask).permute(2, 0, 1)
+    return OffsetTraining(
+        network, copy.deepcopy(network), optimizer, falling, lesson, OffsetSampler(lesson.layout), mask, drawn, [], []
+    )
+
+
+def train_epoch(training: OffsetTraining, config: OffsetTrainingConfig) -> None:
+    """Show all frames once, and keep the network if it is better than before."""
+    train, validation = training.lesson.train, training.lesson.validation
+    training.network.train()
+    losses = []
+    for rows in torch.randperm(len(train)).split(config.batch):
+        if len(rows) == 1 and len(train) > 1:
+            continue  # batch norm needs two
+        loss = _loss(training, train.rows(rows), rows, config)
+        training.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        training.optimizer.step()
+        losses.append(loss.item())
+    training.schedule.step()
+    error = vertex_errors_cm(predict(training.network, training.sampler, validation), validation.vertices)
+    if not training.errors or error < min(training.errors):
+        training.best.load_state_dict(training.network.state_dict())
+    training.losses.append(float(np.mean(losses)))
+    training.errors.append(error)
+
+
+def _loss(
+    training: OffsetTraining, part: OffsetFrames, rows: Int[Tensor, " B"], config: OffsetTrainingConfig
+) -> Float[Tensor, ""]:
+    """Of a batch: of offsets for the baselines; of images, and with a weight of normals, for the decoder."""
+    drawn = training.drawn
+    half_precision = config.half_precision and drawn is not None
+    with torch.autocast("cpu", torch.bfloat16, enabled=half_precision):
+        made = training.network(part.pose)
+    if drawn is None:
+        return (made - part.offsets).norm(dim=-1).mean()
+    made = made.float()
+    loss = grid_loss(made, drawn[rows].float(), training.mask, config.norm)
+    if config.normal_weight > 0:
+        faces = torch.from_numpy(training.lesson.layout.garment.template.faces).long()
+        placed = training.sampler.positions(training.sampler(made), part.points, part.axes)
+        loss = loss + config.normal_weight * normal_loss(placed, part.vertices, faces)
+    return loss
+
+
+def train_offsets(network: nn.Module, lesson: OffsetLesson, config: OffsetTrainingConfig) -> list[float]:
     """Train a decoder or a baseline in place, keep its best epoch; the validation error of every epoch, cm.
 
     Baselines minimise the mean length of the difference of offsets; the decoder the grid loss, and with a weight the
     loss of the normals.
     """
-    torch.manual_seed(config.seed)
-    sampler, faces = OffsetSampler(layout), torch.from_numpy(layout.garment.template.faces).long()
-    mask = torch.from_numpy(layout.mask).permute(2, 0, 1)
-    drawn = _drawn(layout, train) if isinstance(network, ImageDecoder) else None
-    if drawn is not None:
-        network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
-        drawn = drawn.contiguous(memory_format=torch.channels_last)
-    if config.centred:
-        _start_from_mean(network, train, drawn)
-    half_precision = config.half_precision and drawn is not None
-    optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate)
-    falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, config.epochs)
-    best, weights, errors = float("inf"), {}, []
-    for _ in range(config.epochs):
-        network.train()
-        for rows in torch.randperm(len(train)).split(config.batch):
-            if len(rows) == 1 and len(train) > 1:
-                continue  # batch norm needs two
-            part = train.rows(rows)
-            with torch.autocast("cpu", torch.bfloat16, enabled=half_precision):
-                made = network(part.pose)
-            if drawn is not None:
-                made = made.float()
-                loss = grid_loss(made, drawn[rows].float(), mask, config.norm)
-                if config.normal_weight > 0:
-                    placed = sampler.positions(sampler(made), part.points, part.axes)
-                    loss = loss + config.normal_weight * normal_loss(placed, part.vertices, faces)
-            else:
-                loss = (made - part.offsets).norm(dim=-1).mean()
-            optimizer.zero_grad(set_to_none=True)
-            loss.backward()
-            optimizer.step()
-        falling.step()
-        errors.append(vertex_errors_cm(predict(network, sampler, validation), validation.vertices))
-        if errors[-1] < best or not weights:
-            best, weights = errors[-1], {name: value.clone() for name, value in network.state_dict().items()}
-        if len(errors) - int(np.argmin(errors)) > config.patience:
-            break
-    network.load_state_dict(weights)
-    return errors
+    training = start_training(network, lesson, config)
+    while not training.is_over(config):
+        train_epoch(training, config)
+    network.load_state_dict(training.best.state_dict())
+    return training.errors

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from capture4d.types import Mesh
 from wrinkles.normal_maps.config import PRESETS, MapConfig, NetworkConfig
 from wrinkles.normal_maps.inference import WrinkleModel
 from wrinkles.normal_maps.networks import PatchDiscriminator, UNet, set_test_statistics
@@ -94,7 +95,7 @@ def test_half_precision_changes_a_map_by_less_than_half_a_degree(output: Literal
     torch.manual_seed(0)
     config = NetworkConfig(filters=32, layers=4, output=output, dropout=0.0)
     model = WrinkleModel(UNet(config), config, texels=32, maps=MapConfig(size=32), layout_digest="",
-                         reference=np.zeros((1, 3), np.float32))  # fmt: skip
+                         template=Mesh(np.zeros((1, 3), np.float32), np.zeros((0, 3), np.int32)))  # fmt: skip
     low = torch.nn.functional.normalize(torch.randn(3, 32, 32), dim=0)
     low[:, :5] = 0
     full, half = (model.generate(low, half_precision=each) for each in (False, True))

@@ -16,8 +16,11 @@ import safetensors.torch
 import torch
 from scipy.spatial.transform import Rotation
 
+from capture4d.captures.work_folder import load_registration
+from capture4d.errors import InputError
 from capture4d.files.atomic import read_json, write_bytes, write_json, write_npy, write_npz
 from capture4d.files.records import load_garment, save_garment
+from capture4d.files.tensors import read_tensors, write_tensors
 from capture4d.geometry.mesh import submesh
 from capture4d.runs.stage import open_stage
 from capture4d.types import Garment, Mesh
@@ -30,11 +33,13 @@ from tests.unit.wrinkles.conftest import (
     some_scan,
     wrinkle_normals,
 )
-from wrinkles.normal_maps import train_stage
+from wrinkles.normal_maps import pair_files, train_stage
 from wrinkles.normal_maps.config import MapConfig
 from wrinkles.normal_maps.display import fill_holes
+from wrinkles.normal_maps.inference import KIND, load_model
 from wrinkles.normal_maps.spaces import decode_png, encode_png
 from wrinkles.normal_maps.template import MapTemplate
+from wrinkles.normal_maps.wrinkle_maps import wrinkle_map
 
 SMALL = ["--pairs.map.size", "64", "--texels", "32", "--network.filters", "4", "--network.layers", "5",
          "--schedule.steps", "6", "--schedule.checkpoint-every", "2", "--schedule.sample-every", "3",
@@ -139,7 +144,7 @@ def test_an_animation_borrows_the_high_maps_of_the_take_it_follows(
     size = ("--map.size", "64", "--workers", "1")
     animated = turned_copy(work, tmp_path / "animated", [2, 3, 9])
     arguments = ("wrinkles", "maps", animated, "--high-from", work, *size)
-    missing = f"{work / 'wrinkles' / 'pairs'}: expected the output of 'pairs', found none"
+    missing = f"{work / 'wrinkles' / 'pairs'}: expected the output of 'wrinkles maps', found none"
     assert fails(capsys, *arguments) == f"{missing}; run: capture4d wrinkles maps {work}"
     assert run("wrinkles", "maps", work, *size) == 0
     assert run(*arguments) == 0
@@ -182,6 +187,74 @@ def test_a_model_is_trained_measured_and_applied(work: Path, trained: Path, garm
     world = from_tangent(tangent, template.frames(garment.template.vertices))
     assert (world * template.low_normals(garment.template.vertices)).sum(1).mean() > 0.7
     assert np.load(made / "tangents.npy").shape == (len(garment.template.faces), 3, 4)
+
+
+def test_a_map_as_an_array_is_the_map_as_a_file(work: Path, trained: Path, garment: Garment):
+    assert run("wrinkles", "apply", trained, work, "--workers", "1") == 0
+    frames = work / "wrinkles" / "generated" / "frames"
+    written = [decode_png((frames / f"{frame:06d}.png").read_bytes(), source="made")[0] for frame in (1, 2)]
+    vertices = load_registration(work / "registration").vertices[:2]
+    made = wrinkle_map(trained, vertices)
+    assert made.dtype == np.float32
+    assert made.shape == (2, 64, 64, 3)
+    np.testing.assert_allclose(made, written, atol=1.01 / 65535)  # half a step of 16 bit, and what rounding adds
+    one = wrinkle_map(load_model(trained), vertices[1], template=garment)
+    np.testing.assert_array_equal(one, made[1])
+    with pytest.raises(InputError, match=r"vertices: expected \(frames, 768, 3\) or \(768, 3\), found \(5, 3\)"):
+        wrinkle_map(trained, vertices[0, :5])
+
+
+def test_a_model_that_kept_no_template_wants_one(work: Path, trained: Path, garment: Garment):
+    """As earlier versions wrote them."""
+    vertices = load_registration(work / "registration").vertices[0]
+    wanted = wrinkle_map(trained, vertices)
+    path = trained / "generator.safetensors"
+    file = read_tensors(path, KIND)
+    kept = {name: each for name, each in file.tensors.items() if name not in ("faces", "uv")}
+    write_tensors(path, KIND, kept, {name: each for name, each in file.note.items() if name != "kind"})
+    with pytest.raises(InputError, match="template: expected one"):
+        wrinkle_map(trained, vertices)
+    np.testing.assert_array_equal(wrinkle_map(trained, vertices, template=garment), wanted)
+    turned = Mesh(garment.template.vertices, garment.template.faces[::-1].copy(), garment.template.uv)
+    with pytest.raises(InputError, match="template: expected the one that the network was trained on"):
+        wrinkle_map(trained, vertices, template=replace(garment, template=turned))
+    assert run("wrinkles", "apply", trained, work, "--workers", "1") == 0
+
+
+def test_folders_of_stages_that_had_other_names_are_gone_on_with(work: Path, trained: Path):
+    assert run("wrinkles", "maps", work, "--map.size", "64", "--workers", "1") == 0
+    assert run("wrinkles", "apply", trained, work, "--workers", "1") == 0
+    before = {}
+    for folder, name, former in (
+        (work / "wrinkles" / "pairs", "wrinkles maps", "pairs"),
+        (trained, "wrinkles train", "train-wrinkles"),
+        (work / "wrinkles" / "generated", "wrinkles apply", "wrinkles"),
+    ):
+        record = json.loads((folder / "stage.json").read_text())
+        assert record["stage"] == name
+        (folder / "stage.json").write_text(json.dumps(record | {"stage": former}))
+        before[folder] = record["digest"]
+    frame = work / "wrinkles" / "generated" / "frames" / "000001.png"
+    made = frame.stat().st_mtime_ns
+    assert run(*train(work, trained)) == 0
+    assert run("wrinkles", "maps", work, "--map.size", "64", "--workers", "1") == 0
+    assert run("wrinkles", "apply", trained, work, "--workers", "1") == 0
+    assert frame.stat().st_mtime_ns == made
+    for folder, digest in before.items():
+        assert json.loads((folder / "stage.json").read_text())["digest"] == digest
+
+
+def test_a_training_opens_the_maps_of_a_take_once(work: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    assert run("wrinkles", "maps", work, "--map.size", "64", "--workers", "1") == 0
+    opened: list[str] = []
+
+    def counting(path: Path) -> Garment:
+        opened.append(Path(path).name)
+        return load_garment(path)
+
+    monkeypatch.setattr(pair_files, "load_garment", counting)
+    assert run(*train(work, tmp_path / "again")) == 0
+    assert opened == ["template.npz"]
 
 
 def test_green_is_flipped_on_demand_and_delivery_is_8_bit(work: Path, trained: Path):

@@ -11,10 +11,11 @@ from capture4d.errors import InputError
 from capture4d.learning.networks import ImageDecoder
 from capture4d.types import Body, Garment, Mesh, PoseSequence
 from tests.unit.wrinkles.conftest import sleeve, wrinkled
+from wrinkles.offset_images.config import OffsetTrainingConfig
 from wrinkles.offset_images.layout import Anchors, OffsetLayout, OffsetSampler, decode, encode
 from wrinkles.offset_images.networks import FullyConnected, PcaFullyConnected
 from wrinkles.offset_images.training import (
-    OffsetConfig,
+    OffsetLesson,
     grid_loss,
     normal_loss,
     offset_frames,
@@ -191,13 +192,13 @@ def test_networks_have_the_known_numbers_of_parameters():
         assert parameters(decoder) == 3_785_322
         assert parameters(FullyConnected(90, 3000)) == 2_402_088
     offsets = torch.randn(140, 50, 3)
-    assert parameters(PcaFullyConnected(90, offsets, components=128)) == 121_984
+    assert parameters(PcaFullyConnected.analysed(90, offsets, components=128)) == 121_984
 
 
 def test_components_reproduce_what_they_span():
     torch.manual_seed(0)
     offsets = torch.randn(6, 40, 3)
-    network = PcaFullyConnected(9, offsets, components=128)
+    network = PcaFullyConnected.analysed(9, offsets, components=128)
     assert network.basis.shape[0] == 5
     centred = offsets.flatten(1) - network.mean
     coefficients = centred @ torch.linalg.pinv(network.basis)
@@ -244,11 +245,12 @@ def test_decoder_and_baselines_learn_a_bending_sleeve(bound: tuple[Garment, Body
     sampler = OffsetSampler(layout)
     baseline = vertex_errors_cm(sampler.positions(mean, test.points, test.axes), test.vertices)
     torch.manual_seed(0)
-    networks = [ImageDecoder(9, channels=32, doublings=2), PcaFullyConnected(9, train.offsets, components=4),
+    networks = [ImageDecoder(9, channels=32, doublings=2), PcaFullyConnected.analysed(9, train.offsets, components=4),
                 FullyConnected(9, len(layout.vertex))]  # fmt: skip
     for network in networks:
         epochs = 60 if isinstance(network, ImageDecoder) else 250
-        errors = train_offsets(network, layout, train, test, OffsetConfig(epochs=epochs, batch=6, patience=250))
+        config = OffsetTrainingConfig(epochs=epochs, batch=6, patience=250)
+        errors = train_offsets(network, OffsetLesson(layout, train, test), config)
         assert vertex_errors_cm(predict(network, sampler, test), test.vertices) == pytest.approx(min(errors), rel=1e-5)
         assert min(errors) < 0.6 * baseline, type(network).__name__
 

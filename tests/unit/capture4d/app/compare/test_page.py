@@ -9,48 +9,34 @@ import numpy as np
 import pytest
 
 from capture4d.app.compare.garment import model_take
-from capture4d.body.binding import bind
 from capture4d.captures.capture import write_scan
 from capture4d.captures.work_folder import load_moving_body, load_registration
 from capture4d.cli.main import main
 from capture4d.errors import InputError
-from capture4d.files.records import save_body, save_poses
-from capture4d.types import PoseSequence, Scan
+from capture4d.types import Scan
 from retarget.animation.garment_model import load_garment_model
-from tests.unit.wrinkles.conftest import make_work, outside_the_unit_square, some_garment, some_scan
+from tests.unit.wrinkles.conftest import some_scan
 from tests.unit.wrinkles.normal_maps.test_stages import SMALL
-from tests.unit.wrinkles.offset_images.test_layout import limb, upright
+from tests.unit.wrinkles.offset_images.test_stage import bound_work
 
 FRAMES = 8
+OFFSETS = ["--held-out", "0.2", "--texels", "32", "--training.epochs", "2", "--workers", "1"]
 
 
 @pytest.fixture(scope="module")
 def compared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A work folder with its comparison."""
     folder = tmp_path_factory.mktemp("compared")
-    garment, body = outside_the_unit_square(some_garment()), limb()
-    at, weights, skin_weights = bind(garment.template.vertices, garment.template.faces, upright(body))
-    bound = replace(
-        garment, embedding_faces=at, embedding_barycentric=weights, skin_weights=skin_weights.astype(np.float32)
-    )
-    scans = [some_scan(phase=0.3 * frame) for frame in range(FRAMES)]
-    work = make_work(folder, bound, scans)
-    ids = np.arange(1, FRAMES + 1, dtype=np.int32)
-    still = np.tile(np.eye(3, dtype=np.float32), (FRAMES, 2, 1, 1))
-    poses = PoseSequence(still, np.zeros((FRAMES, 3), np.float32), np.zeros(1, np.float32), ids, 60.0, body.joint_names)
-    save_body(folder / "capture" / "body.npz", body)
-    save_poses(folder / "capture" / "poses.npz", poses)
-    wobble = np.sin(np.arange(FRAMES))[:, None, None] * np.float32([0, 0, 1e-3])  # one direction to learn
-    np.save(work / "registration" / "vertices.npy", (garment.template.vertices + wobble).astype(np.float32))
-    records = "".join(json.dumps({"frame_id": frame_id, "verdict": "good"}) + "\n" for frame_id in ids.tolist())
-    (work / "registration" / "metrics.jsonl").write_text(records)
-    for frame_id, scan in zip(ids.tolist(), scans, strict=True):
+    work = bound_work(folder, FRAMES)
+    for frame_id in range(1, FRAMES + 1):
+        scan = some_scan(phase=0.3 * (frame_id - 1))
         colours = np.full((len(scan.vertices), 3), 120, np.uint8)
         write_scan(folder / "capture" / "scans" / f"{frame_id:06d}.ply", Scan(scan, colours, frame_id, 0.0))
     for arguments in (
         ["fit", work, "--regressor", "linear", "--shape.components", "3"],
         ["wrinkles", "train", work, "--output", folder / "model", *SMALL],
-        ["compare", work, "--model", folder / "model", "--image-texels", "32", "--epochs", "2", "--workers", "1"],
+        ["wrinkles", "offsets", work, *OFFSETS],
+        ["compare", work, "--model", folder / "model", "--workers", "1"],
     ):
         with pytest.raises(SystemExit) as exit_:
             main([str(argument) for argument in arguments])
@@ -90,7 +76,7 @@ def test_the_page_stands_alone_and_shows_all(compared: Path):
 
 
 def again(compared: Path, model: Path, *more: str) -> int:
-    command = ["compare", compared.parent, "--model", model, "--image-texels", "32", "--epochs", "2", "--workers", "1"]
+    command = ["compare", compared.parent, "--model", model, "--workers", "1"]
     with pytest.raises(SystemExit) as exit_:
         main([str(argument) for argument in (*command, *more)])
     return int(exit_.value.code or 0)
@@ -173,6 +159,60 @@ def test_a_garment_model_learned_again_makes_the_page_stale(
     assert "regressors" in capsys.readouterr().err
 
 
+def test_offset_images_that_nobody_learned_are_left_out_with_a_word(compared: Path, tmp_path: Path):
+    work = tmp_path / "work"
+    shutil.copytree(compared.parent, work, ignore=shutil.ignore_patterns("compare", "offsets"))
+    assert again(work / "compare", compared.parents[1] / "model") == 0
+    assert f"Offset images: capture4d wrinkles offsets {work}." in (work / "compare" / "index.html").read_text()
+    rows = json.loads((work / "compare" / "compare.json").read_text())["methods"]
+    assert [row["name"] for row in rows] == ["registration", "blendshapes", "regression, linear", "network"]
+    assert "Left out" not in (compared / "index.html").read_text()
+
+
+def test_offset_images_that_have_seen_the_frames_bear_an_asterisk(compared: Path, tmp_path: Path):
+    work = tmp_path / "work"
+    shutil.copytree(compared.parent, work, ignore=shutil.ignore_patterns("compare", "offsets"))
+    with pytest.raises(SystemExit):
+        main(["wrinkles", "offsets", str(work), *OFFSETS, "--held-out", "0"])
+    assert again(work / "compare", compared.parents[1] / "model") == 0
+    rows = json.loads((work / "compare" / "compare.json").read_text())["methods"]
+    assert [row["name"] for row in rows[-2:] if row["learned"]] == ["offset images", "fully connected, PCA"]
+
+
+def test_offset_images_that_are_not_finished_or_not_of_this_take(
+    compared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    work = tmp_path / "work"
+    shutil.copytree(compared.parent, work, ignore=shutil.ignore_patterns("compare"))
+    path = work / "wrinkles" / "offsets" / "stage.json"
+    record = json.loads(path.read_text())
+    for change, said in (
+        ({"status": "running"}, "is not finished"),
+        ({"upstream": {"registration": "another"}}, "from this registration as it is now"),
+    ):
+        path.write_text(json.dumps(record | change))
+        assert again(work / "compare", compared.parents[1] / "model") == 1
+        line = capsys.readouterr().err.splitlines()[-1]
+        assert said in line
+        assert f"run: capture4d wrinkles offsets {work}" in line
+        assert not (work / "compare").exists()
+
+
+def test_a_network_of_other_takes_leaves_the_split_to_the_offset_images(compared: Path, tmp_path: Path):
+    """What was learned from the take decides which frames are held out; --held-out only if nothing was."""
+    model, work = tmp_path / "model", tmp_path / "work"
+    shutil.copytree(compared.parents[1] / "model", model)
+    record = json.loads((model / "stage.json").read_text())
+    (model / "stage.json").write_text(json.dumps(record | {"upstream": {"elsewhere": "0"}}))
+    (model / "takes.json").write_text(json.dumps({"elsewhere": "0"}))
+    shutil.copytree(compared.parent, work, ignore=shutil.ignore_patterns("compare"))
+    assert again(work / "compare", model, "--held-out", "0.4") == 0
+    assert json.loads((work / "compare" / "compare.json").read_text())["frames"] == [7, 8]
+    shutil.rmtree(work / "wrinkles" / "offsets")
+    assert again(work / "compare", model, "--held-out", "0.4", "--overwrite") == 0
+    assert json.loads((work / "compare" / "compare.json").read_text())["frames"] == [6, 7, 8]
+
+
 def test_a_model_of_another_template_is_refused(compared: Path):
     work = compared.parent
     known, sequence = load_garment_model(work), load_registration(work / "registration")
@@ -186,8 +226,8 @@ def test_a_model_of_another_template_is_refused(compared: Path):
 @pytest.mark.parametrize(
     ("option", "value", "said"),
     [
-        ("--image-texels", "100", "power of two"),
-        ("--epochs", "0", "at least 1"),
+        ("--pictures", "0", "at least 1"),
+        ("--gap", "-1", "at least 0"),
         ("--held-out", "0", "above 0, below 1"),
     ],
 )

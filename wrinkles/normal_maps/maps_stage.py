@@ -14,21 +14,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
 
 from capture4d.captures.garment_scans import load_garment_scan
-from capture4d.captures.work_folder import failed_frames, load_registration, registered_digest, work_capture
+from capture4d.captures.work_folder import WorkFolder, open_work
 from capture4d.errors import InputError
 from capture4d.files.atomic import read_json, write_bytes, write_json
-from capture4d.files.records import load_garment, save_garment
+from capture4d.files.records import save_garment
 from capture4d.runs.stage import Stage, StageResult, open_stage, require_complete
-from capture4d.runs.workers import run_jobs
+from capture4d.runs.workers import run_jobs, shared
 from capture4d.types import Mesh, RegisteredSequence
 from wrinkles.normal_maps.config import PairConfig
-from wrinkles.normal_maps.pair_files import layout_digest
+from wrinkles.normal_maps.pair_files import FORMER_NAMES, MAPS, PAIRS, PairFolder, layout_digest, open_pairs
 from wrinkles.normal_maps.spaces import decode_png, encode_png
 from wrinkles.normal_maps.template import FramePair, MapTemplate, frame_pairs
 
@@ -39,16 +38,30 @@ RUN_FRAMES = 24
 """Frames a worker makes in a row; at both ends of a run a scan is read twice."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Run:
-    work: Path
+@dataclass(frozen=True, slots=True, eq=False)
+class _Take:
+    """What the frames of a take are made from."""
+
+    work: WorkFolder
     stage: Stage
+    config: PairConfig
+    template: MapTemplate
     fps: float
-    positions: range
+
+    def scan(self, frame_id: int) -> Mesh | None:
+        """The garment's scan, None if it says nothing."""
+        if frame_id in self.work.failed_frames:
+            return None
+        return load_garment_scan(self.work.path / "garment" / "frames" / f"{frame_id:06d}.npz", frame_id).mesh
 
 
 def run(
-    work: Path, config: PairConfig, *, high_from: Path | None = None, workers: int = 1, overwrite: bool = False
+    work: WorkFolder,
+    config: PairConfig,
+    *,
+    high_from: WorkFolder | None = None,
+    workers: int = 1,
+    overwrite: bool = False,
 ) -> StageResult:
     """Make the pair of every frame that has none yet.
 
@@ -60,103 +73,95 @@ def run(
     """
     if high_from is not None:
         return _borrow(work, high_from, config, overwrite=overwrite)
-    upstream = _inputs(work)
-    fps = work_capture(work).fps
-    template = _template(work, config)
-    sequence = load_registration(work / "registration")
-    output = work / "wrinkles" / "pairs"
-    stage = open_stage(output, name="pairs", schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite)
-    if not (output / "template.npz").is_file():
-        save_garment(output / "template.npz", replace(sequence.garment, template=template.mesh))
+    upstream, sequence = _inputs(work), work.registered
+    fps, template = work.capture.fps, MapTemplate.create(sequence.garment, config.map)
+    stage = open_stage(
+        work.path / PAIRS, name=MAPS, former_names=FORMER_NAMES, schema=SCHEMA, config=config, upstream=upstream,
+        overwrite=overwrite,
+    )  # fmt: skip
+    if not (stage.path / "template.npz").is_file():
+        save_garment(stage.path / "template.npz", replace(sequence.garment, template=template.mesh))
     frame_ids = sequence.frame_ids.tolist()
     pending = set(_pending(stage, frame_ids))
     runs = [range(start, min(start + RUN_FRAMES, len(frame_ids))) for start in range(0, len(frame_ids), RUN_FRAMES)]
-    jobs = [
-        _Run(work, stage, fps, positions) for positions in runs if pending.intersection(frame_ids[p] for p in positions)
-    ]
+    jobs = [positions for positions in runs if pending.intersection(frame_ids[p] for p in positions)]
 
     def finished() -> int:
         return len(frame_ids) - len(_pending(stage, frame_ids))
 
-    make = partial(_make, config)
-    for _ in run_jobs(make, jobs, workers=workers, label="normal maps", units=_length, finished=finished):
+    take = shared(_Take(work, stage, config, template, fps))
+    for _ in run_jobs(_make, jobs, prepare=take, workers=workers, label="normal maps", units=len, finished=finished):
         pass
-    _template.cache_clear()
     maps = [stage.frame_path(frame_id, ".png", folder=folder) for folder in ("low", "high") for frame_id in frame_ids]
-    return stage.finish([output / "template.npz", *maps])
+    return stage.finish([stage.path / "template.npz", *maps])
 
 
-def _borrow(work: Path, lender: Path, config: PairConfig, *, overwrite: bool) -> StageResult:
+def _borrow(work: WorkFolder, lender: WorkFolder, config: PairConfig, *, overwrite: bool) -> StageResult:
     """Pairs of this sequence's low maps with another's high maps; the frames that both have."""
-    pairs, upstream = lender / "wrinkles" / "pairs", _lent(work, lender)
-    sequence, theirs = load_registration(work / "registration"), load_registration(lender / "registration")
+    digest, lent = work.registered_digest, open_pairs(lender.path)
+    sequence, theirs = work.registered, lender.registered
     template = MapTemplate.create(sequence.garment, config.map)
-    lent = load_garment(pairs / "template.npz").template
-    if layout_digest(lent, config.map.size) != layout_digest(template.mesh, config.map.size):
-        raise InputError(f"{lender}: expected maps of the template and layout of {work}, found others")
-    template = template.referred_to(lent.vertices)
+    if layout_digest(lent.template, config.map.size) != layout_digest(template.mesh, config.map.size):
+        raise InputError(f"expected maps of the template and layout of {work.path}, found others", where=lender.path)
+    template = template.referred_to(lent.template.vertices)
     rows = {int(frame_id): row for row, frame_id in enumerate(theirs.frame_ids)}
-    shared = [(row, int(frame_id)) for row, frame_id in enumerate(sequence.frame_ids) if int(frame_id) in rows]
-    if not shared:
-        raise InputError(f"{lender}: expected frames of {work}, found none of its {len(sequence.frame_ids)}")
-    output = work / "wrinkles" / "pairs"
-    sources = {"pairs": pairs}
+    common = [(row, int(frame_id)) for row, frame_id in enumerate(sequence.frame_ids) if int(frame_id) in rows]
+    if not common:
+        raise InputError(
+            f"expected frames of {work.path}, found none of its {len(sequence.frame_ids)}", where=lender.path
+        )
     stage = open_stage(
-        output, name="pairs", schema=SCHEMA, config=config, upstream=upstream, sources=sources, overwrite=overwrite
-    )
-    if not (output / "template.npz").is_file():
+        work.path / PAIRS, name=MAPS, former_names=FORMER_NAMES, schema=SCHEMA, config=config,
+        upstream={"registration": digest, "pairs": lent.digest}, sources={"pairs": lent.path}, overwrite=overwrite,
+    )  # fmt: skip
+    if not (stage.path / "template.npz").is_file():
         referred = template.mesh.with_vertices(template.reference)
-        save_garment(output / "template.npz", replace(sequence.garment, template=referred))
-    pending = set(_pending(stage, [frame_id for _, frame_id in shared]))
+        save_garment(stage.path / "template.npz", replace(sequence.garment, template=referred))
+    pending = set(_pending(stage, [frame_id for _, frame_id in common]))
     shown = template.raster.image(np.ones(len(template.raster.inside), bool))
-    for row, frame_id in shared:
+    for row, frame_id in common:
         if frame_id not in pending:
             continue
         vertices = np.array(sequence.vertices[row])
         ours = template.rotation(vertices)
         turn = (template.rotation(np.array(theirs.vertices[rows[frame_id]])).T @ ours).astype(np.float32)
-        path = pairs / "high" / f"{frame_id:06d}.png"
+        path = lent.path / "high" / f"{frame_id:06d}.png"
         high, known = decode_png(path.read_bytes(), source=str(path))
         if high.shape[0] != template.raster.size:
-            raise InputError(f"{path}: expected a map of {template.raster.size} texels, found {high.shape[0]}")
+            raise InputError(f"expected a map of {template.raster.size} texels, found {high.shape[0]}", where=path)
         low = template.raster.image(template.low_normals(vertices) @ ours.astype(np.float32))
         write_bytes(stage.frame_path(frame_id, ".png", folder="low"), encode_png(low, shown))
         write_bytes(stage.frame_path(frame_id, ".png", folder="high"), encode_png(high @ turn, known))
-    maps = [stage.frame_path(frame_id, ".png", folder=folder) for folder in ("low", "high") for _, frame_id in shared]
-    return stage.finish([output / "template.npz", *maps])
+    maps = [stage.frame_path(frame_id, ".png", folder=folder) for folder in ("low", "high") for _, frame_id in common]
+    return stage.finish([stage.path / "template.npz", *maps])
 
 
-def ensure_pairs(work: Path, config: PairConfig, *, workers: int = 1) -> None:
-    """Make a work folder's pairs, unless it has finished ones of its present inputs, whatever their settings.
+def ensure_pairs(work: WorkFolder, config: PairConfig, *, workers: int = 1) -> PairFolder:
+    """A work folder's pairs; made, unless it has finished ones of its present inputs, whatever their settings.
 
     Raises:
         InputError: an input is missing, or it is not what the pairs were made from.
     """
-    record_path = work / "wrinkles" / "pairs" / "stage.json"
+    record_path = work.path / PAIRS / "stage.json"
     record = read_json(record_path) if record_path.is_file() else {}
-    made_from = record.get("upstream", {})
+    made_from, complete = record.get("upstream", {}), record.get("status") == "complete"
     if "pairs" in made_from:
-        lender = Path(record["sources"]["pairs"]).parents[1]
-        if _lent(work, lender) == made_from and record["status"] == "complete":
-            return
-        run(work, config, high_from=lender, workers=workers)
-    elif record.get("status") != "complete" or made_from != _inputs(work):
+        lender = open_work(Path(record["sources"]["pairs"]).parents[1])
+        lent = {"registration": work.registered_digest, "pairs": open_pairs(lender.path).digest}
+        if not complete or made_from != lent:
+            run(work, config, high_from=lender, workers=workers)
+    elif not complete or made_from != _inputs(work):
         run(work, config, workers=workers)
+    return open_pairs(work.path)
 
 
-def _inputs(work: Path) -> dict[str, str]:
+def _inputs(work: WorkFolder) -> dict[str, str]:
     """Digests of what pairs of a take's own scans are made from."""
     return {
-        "registration": registered_digest(work),
-        "garment": require_complete(work / "garment", "extract", f"capture4d extract CAPTURE --output {work}"),
-    }
-
-
-def _lent(work: Path, lender: Path) -> dict[str, str]:
-    """Digests of what borrowed pairs are made from."""
-    return {
-        "registration": registered_digest(work),
-        "pairs": require_complete(lender / "wrinkles" / "pairs", "pairs", f"capture4d wrinkles maps {lender}"),
+        "registration": work.registered_digest,
+        "garment": require_complete(
+            work.path / "garment", "extract", f"capture4d extract CAPTURE --output {work.path}"
+        ),
     }
 
 
@@ -166,37 +171,19 @@ def _pending(stage: Stage, frame_ids: Sequence[int]) -> list[int]:
     return [frame_id for frame_id in frame_ids if frame_id in missing]
 
 
-def _length(job: _Run) -> int:
-    return len(job.positions)
-
-
-@lru_cache(maxsize=1)
-def _template(work: Path, config: PairConfig) -> MapTemplate:
-    """One analysis per process and take."""
-    return MapTemplate.create(load_registration(work / "registration").garment, config.map)
-
-
-def _make(config: PairConfig, job: _Run) -> int:
+def _make(take: _Take, positions: range) -> int:
     """Make and write the missing frames of a run; how many there were."""
-    template = _template(job.work, config)
-    sequence = load_registration(job.work / "registration")
-    frame_ids, failed = sequence.frame_ids.tolist(), failed_frames(job.work)
-    pending = set(_pending(job.stage, [frame_ids[p] for p in job.positions]))
-    missing = [position for position in job.positions if frame_ids[position] in pending]
-
-    def scan(position: int) -> Mesh | None:
-        frame_id = frame_ids[position]
-        if frame_id in failed:
-            return None
-        return load_garment_scan(job.work / "garment" / "frames" / f"{frame_id:06d}.npz", frame_id).mesh
-
+    sequence = take.work.registered
+    frame_ids = sequence.frame_ids.tolist()
+    pending = set(_pending(take.stage, [frame_ids[p] for p in positions]))
+    missing = [position for position in positions if frame_ids[position] in pending]
     pairs = frame_pairs(
-        template, frame_ids, range(missing[0], missing[-1] + 1),
-        vertices=lambda position: np.array(sequence.vertices[position]), scan=scan, fps=job.fps,
-        config=config.projection,
+        take.template, frame_ids, range(missing[0], missing[-1] + 1),
+        vertices=lambda position: np.array(sequence.vertices[position]),
+        scan=lambda position: take.scan(frame_ids[position]), fps=take.fps, config=take.config.projection,
     )  # fmt: skip
     for pair in pairs:
-        _write(job.stage, template, sequence, pair)
+        _write(take.stage, take.template, sequence, pair)
     return len(missing)
 
 

@@ -1,0 +1,234 @@
+"""The stage that learns offset images: a registered WORK in, WORK/wrinkles/offsets out.
+
+stage.json                       what was run
+decoder.safetensors              from poses to images of offsets
+fully_connected_pca.safetensors  the baseline without images: from poses to principal components of the offsets
+frames.json                      frames that were learned from, that chose the epoch, and that were held out
+metrics.jsonl                    loss and validation error of every epoch
+checkpoints/decoder-000010.safetensors   everything a resume needs; the last one of each network is kept
+
+References: Jin et al., A pixel-based framework for data-driven clothing, SCA 2020, sections 5 and 6.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from capture4d.captures.work_folder import WorkFolder
+from capture4d.errors import InputError
+from capture4d.files.atomic import write_bytes, write_json
+from capture4d.files.checkpoints import read_checkpoint, write_checkpoint
+from capture4d.runs.stage import Stage, StageResult, open_stage
+from capture4d.runs.workers import progress
+from wrinkles.frame_split import split_rows
+from wrinkles.offset_images.config import OffsetConfig, OffsetTrainingConfig
+from wrinkles.offset_images.layout import OffsetLayout
+from wrinkles.offset_images.model_files import (
+    BASELINE,
+    DECODER,
+    FRAMES,
+    NETWORKS,
+    STAGE,
+    OffsetModel,
+    load_offset_model,
+    save_offset_model,
+)
+from wrinkles.offset_images.networks import PcaFullyConnected, image_decoder
+from wrinkles.offset_images.training import (
+    OffsetLesson,
+    OffsetTraining,
+    offset_frames,
+    pose_joints,
+    start_training,
+    train_epoch,
+)
+
+__all__ = ["run"]
+
+SCHEMA = 1
+METRICS = "metrics.jsonl"
+KIND = "training of offset images"
+COMMAND = "capture4d wrinkles offsets WORK"
+BATCHES, SMALLEST_BATCH = 8, 4
+"""A short take is learned from in as many batches, unless they become too small for batch norm."""
+VALIDATION = 9
+"""The last ninth of the frames chooses the epoch, as the paper regularises on a ninth."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Parts:
+    """Positions in the registered sequence."""
+
+    learned: Sequence[int]
+    chose_epoch: Sequence[int]
+    held_out: Sequence[int]
+
+
+def run(
+    work: WorkFolder, output: Path, config: OffsetConfig, *, workers: int = 1, overwrite: bool = False
+) -> StageResult:
+    """Learn the decoder and the baseline, unless that has been done.
+
+    Equal inputs, settings and numbers of `workers`, which are torch's threads here, give equal weights, however often
+    the run was interrupted.
+
+    Args:
+        work: work folder of a registered take whose template is bound to a body.
+        output: folder to write; WORK/wrinkles/offsets is where `compare` looks.
+    Raises:
+        InputError: there is no registration, no body that moved the template, or not frames enough; or a checkpoint is
+            damaged.
+    """
+    digest, sequence = work.registered_digest, work.registered
+    garment = sequence.garment
+    layout = OffsetLayout.create(garment, config.texels)
+    body, poses = work.require_posed_body()
+    poses = poses.of_frames(sequence.frame_ids)
+    weights = garment.skin_weights
+    if weights is None or weights.shape[1] != len(body.joint_names) or poses.joint_names != body.joint_names:
+        raise InputError("expected a template that is bound to the body that moved it, found another", where=work.path)
+    parts = _split(work, sequence.frame_ids, config)
+    stage = open_stage(
+        output, name=STAGE, schema=SCHEMA, config=config, upstream={"registration": digest}, overwrite=overwrite
+    )
+    products = [stage.path / FRAMES, *(_model(stage, name) for name in NETWORKS)]
+    if stage.was_complete and all(path.is_file() for path in [*products, stage.path / METRICS]):
+        return stage.finish(products, changed=False)
+    torch.set_num_threads(workers)
+    joints = pose_joints(poses, weights)
+
+    def encoded(rows: Sequence[int]):
+        frames = poses.of_frames(sequence.frame_ids[list(rows)])
+        return offset_frames(layout, body, frames, np.array(sequence.vertices[list(rows)]), joints)
+
+    lesson = OffsetLesson(layout, encoded(parts.learned), encoded(parts.chose_epoch))
+    frames = {name: sequence.frame_ids[list(getattr(parts, name))] for name in _Parts.__dataclass_fields__}
+    write_json(stage.path / FRAMES, frames)
+    _learn(stage, lesson, joints, config)
+    return stage.finish(products)
+
+
+def _split(work: WorkFolder, frame_ids: Int[np.ndarray, " frames"], config: OffsetConfig) -> _Parts:
+    """The end of the take is held out; of the rest, frames that failed are left out, and the last choose the epoch."""
+    start, end = split_rows(len(frame_ids), held_out=config.held_out, gap=config.held_out_gap, name=str(work.path))
+    sound = [row for row in start if int(frame_ids[row]) not in work.failed_frames]
+    if len(sound) < 2:
+        raise InputError(
+            f"expected at least 2 soundly registered frames to learn from, found {len(sound)}", where=work.path
+        )
+    cut = len(sound) - max(len(sound) // VALIDATION, 1)
+    return _Parts(sound[:cut], sound[cut:], end)
+
+
+def _learn(stage: Stage, lesson: OffsetLesson, joints: Int[np.ndarray, " joints"], config: OffsetConfig) -> None:
+    """Train what is not trained yet, one network after the other."""
+    batch = min(config.training.batch, max(SMALLEST_BATCH, len(lesson.train) // BATCHES))
+    settings = replace(config.training, batch=batch)
+    pose_size = lesson.train.pose.shape[1]
+    torch.manual_seed(settings.seed)  # both are made before either learns: what one draws does not hang on the other
+    networks = {
+        DECODER: image_decoder(pose_size, config.texels),
+        BASELINE: PcaFullyConnected.analysed(pose_size, lesson.train.offsets, components=config.components),
+    }
+    before: list[Mapping[str, Any]] = []
+    for name, network in networks.items():
+        path = _model(stage, name)
+        if not path.is_file():
+            training = start_training(network, lesson, settings)
+            _train(stage, name, training, before, settings)
+            network.load_state_dict(training.best.state_dict())
+            save_offset_model(path, OffsetModel(network, joints, config.texels, _history(name, training)))
+        before += load_offset_model(path).history
+        _write_metrics(stage, before)
+
+
+def _train(
+    stage: Stage,
+    name: str,
+    training: OffsetTraining,
+    before: Sequence[Mapping[str, Any]],
+    config: OffsetTrainingConfig,
+) -> None:
+    """Go on to the last epoch.
+
+    Args:
+        before: rows of the log about the networks that learned before this one.
+    """
+    _resume(stage, name, training)
+    with progress(name.replace("_", " "), config.epochs, completed=len(training.errors)) as advance:
+        while not training.is_over(config):
+            train_epoch(training, config)
+            advance(1)
+            if len(training.errors) % config.checkpoint_every == 0 or training.is_over(config):
+                _write_metrics(stage, [*before, *_history(name, training)])
+                _save(stage, name, training)
+
+
+def _model(stage: Stage, name: str) -> Path:
+    return stage.path / f"{name}.safetensors"
+
+
+def _checkpoints(stage: Stage, name: str) -> list[Path]:
+    """The oldest first."""
+    return sorted((stage.path / "checkpoints").glob(f"{name}-*.safetensors"))
+
+
+def _save(stage: Stage, name: str, training: OffsetTraining) -> None:
+    earlier = _checkpoints(stage, name)
+    path = stage.path / "checkpoints" / f"{name}-{len(training.errors):06d}.safetensors"
+    write_checkpoint(
+        path,
+        KIND,
+        modules={"network": training.network, "best": training.best},
+        optimisers={"network": training.optimizer},
+        tensors={"losses": _numbers(training.losses), "errors": _numbers(training.errors)},
+    )
+    for old in earlier:
+        if old != path:
+            old.unlink()
+
+
+def _resume(stage: Stage, name: str, training: OffsetTraining) -> None:
+    """Go on from the newest checkpoint, if there is one."""
+    paths = _checkpoints(stage, name)
+    if not paths:
+        return
+    tensors, _ = read_checkpoint(
+        paths[-1],
+        KIND,
+        modules={"network": training.network, "best": training.best},
+        optimisers={"network": training.optimizer},
+        command=COMMAND,
+    )
+    training.go_on_from(tensors["losses"].tolist(), tensors["errors"].tolist())
+
+
+def _numbers(values: Sequence[float]) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def _history(name: str, training: OffsetTraining) -> list[dict[str, Any]]:
+    """One row an epoch; null where a number is not finite, as JSON has it."""
+    return [
+        {
+            "network": name,
+            "epoch": epoch,
+            "loss": loss if math.isfinite(loss) else None,
+            "validation_cm": error if math.isfinite(error) else None,
+        }
+        for epoch, (loss, error) in enumerate(zip(training.losses, training.errors, strict=True), start=1)
+    ]
+
+
+def _write_metrics(stage: Stage, rows: Sequence[Mapping[str, Any]]) -> None:
+    write_bytes(stage.path / METRICS, "".join(json.dumps(row) + "\n" for row in rows).encode())
