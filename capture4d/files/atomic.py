@@ -138,7 +138,7 @@ def read_json(path: str | Path) -> dict[str, Any]:
 def parse_json(data: bytes, path: Path) -> dict[str, Any]:
     """The object in a file's bytes; damage is an InputError that names the file."""
     with reading(path, "JSON file"):
-        return _json_object(data.decode())
+        return _json_object(data)
 
 
 def read_json_lines(path: str | Path) -> list[dict[str, Any]]:
@@ -154,9 +154,9 @@ def read_json_lines(path: str | Path) -> list[dict[str, Any]]:
     return rows
 
 
-def _json_object(text: str) -> dict[str, Any]:
+def _json_object(text: str | bytes) -> dict[str, Any]:
     try:
-        found = json.loads(text)
+        found = json.loads(text if isinstance(text, str) else text.decode())
     except (ValueError, RecursionError) as error:
         raise InputError(f"not valid JSON ({error})") from None
     if not isinstance(found, dict):
