@@ -39,9 +39,10 @@ class MeshSequence:
             return read_mesh(path).mesh
         vertices, faces = self.arrays
         try:
-            return Mesh(vertices[frame_id].astype(np.float32), faces.astype(np.int32))
+            with np.errstate(over="ignore", invalid="ignore"):  # what is no number is found in the mesh
+                return Mesh(vertices[frame_id].astype(np.float32), faces.astype(np.int32))
         except InputError as error:
-            raise InputError(f"{path}: frame {frame_id}: {error}") from None
+            raise InputError(f"frame {frame_id}: {error.reason}", where=path) from None
 
     def digest(self) -> str:
         return file_digest(set(self.files.values()), root=self.path if self.path.is_dir() else self.path.parent)
@@ -56,9 +57,11 @@ def open_sequence(path: Path) -> MeshSequence:
     if path.is_file() and path.suffix == ".npz":
         with ArrayFile(path) as arrays:
             vertices, faces = arrays["vertices"], arrays["faces"]
-        shape = vertices.shape
-        if len(shape) != 3 or shape[2] != 3 or not shape[0]:
-            raise InputError(f"{path}: expected vertices of shape (frames, vertices, 3), found {shape}")
+            shape = vertices.shape
+            if len(shape) != 3 or shape[2] != 3 or not shape[0] or vertices.dtype.kind not in "iuf":
+                raise InputError(f"expected vertices of shape (frames, vertices, 3), found {shape} of {vertices.dtype}")
+            if faces.dtype.kind not in "iu":
+                raise InputError(f"expected whole numbers as faces, found {faces.dtype}")
         return MeshSequence(path, dict.fromkeys(range(shape[0]), path), (vertices, faces))
     if not path.is_dir():
         found = "a file" if path.exists() else "nothing"

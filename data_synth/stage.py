@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,7 +11,8 @@ import numpy as np
 from capture4d.captures.capture import Capture, write_capture_description, write_scan
 from capture4d.captures.truth import TruthFrame, TruthModel, write_truth_frame, write_truth_model
 from capture4d.errors import InputError
-from capture4d.files.atomic import file_digest, write_json, write_npz
+from capture4d.files.arrays import ArrayFile
+from capture4d.files.atomic import file_digest, read_json, write_json, write_npz
 from capture4d.files.records import load_rig, save_body, save_garment, save_poses, save_rig
 from capture4d.runs.stage import Stage, StageResult, open_stage
 from capture4d.runs.workers import run_jobs
@@ -224,7 +224,7 @@ def scan_frame(job: ScanJob) -> int:
         _PREPARED[job.config] = prepare_take(job.config), load_rig(job.stage.path / "rig.json")
     take, rig = _PREPARED[job.config]
     folder, frame_id, config = job.stage.path, job.frame_id, job.config
-    with np.load(folder / "cloth" / f"{frame_id:06d}.npz", allow_pickle=False) as cloth:
+    with ArrayFile(folder / "cloth" / f"{frame_id:06d}.npz") as cloth:
         fine, surface = cloth["vertices"], cloth["body"]
     labels = np.zeros(0, np.uint8)
     if config.scans:
@@ -251,8 +251,7 @@ def _write_quality(stage: Stage, frame_ids: list[int]) -> None:
     if path.exists():
         return
     rows = [
-        {"frame_id": frame_id, **json.loads((stage.path / "cloth" / f"{frame_id:06d}.json").read_text())}
-        for frame_id in frame_ids
+        {"frame_id": frame_id, **read_json(stage.path / "cloth" / f"{frame_id:06d}.json")} for frame_id in frame_ids
     ]
     write_json(path, rows)
     bad = [row for row in rows if row["reasons"]]

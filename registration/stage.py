@@ -28,6 +28,7 @@ from capture4d.captures.work_folder import (
     tracking_digest,
 )
 from capture4d.errors import InputError
+from capture4d.files.arrays import ArrayFile
 from capture4d.files.atomic import nan_to_none, read_json, write_json, write_json_lines, write_npz
 from capture4d.files.records import save_garment
 from capture4d.runs.stage import Stage, StageResult, open_stage, require_complete
@@ -134,7 +135,7 @@ def _register_segment(take: _Take, positions: range) -> int:
     def done(frame_id: int) -> tuple[np.ndarray, bool] | None:
         if frame_id in pending:
             return None
-        with np.load(stage.frame_path(frame_id), allow_pickle=False) as arrays:
+        with ArrayFile(stage.frame_path(frame_id)) as arrays:
             return arrays["vertices"], VERDICTS[int(arrays["verdict"])] != "failed"
 
     results = register_run(

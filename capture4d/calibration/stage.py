@@ -25,6 +25,7 @@ from capture4d.cameras.colmap import read_model, write_model
 from capture4d.errors import InputError
 from capture4d.files.arrays import ArrayFile
 from capture4d.files.atomic import read_json, write_json, write_npz
+from capture4d.files.reading import reading
 from capture4d.files.records import load_rig, save_rig
 from capture4d.runs.workers import run_jobs
 
@@ -194,14 +195,11 @@ def find_images(folder: Path, pattern: str = PATTERN) -> list[BoardImage]:
 
 
 def _detect(board: Board, image: BoardImage) -> _Detection:
-    try:
-        picture = cv2.imdecode(
-            np.frombuffer(image.path.read_bytes(), np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-        )
-    except cv2.error:
-        picture = None
-    if picture is None:
-        raise InputError(f"{image.path}: not a readable image, cut off or damaged")
+    with reading(image.path, "image"):
+        data = np.frombuffer(image.path.read_bytes(), np.uint8)
+        picture = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+        if picture is None:
+            raise InputError("not a readable image, cut off or damaged")
     ids, pixels = detect_corners(picture, board)
     return _Detection(image, (picture.shape[1], picture.shape[0]), ids, pixels)
 

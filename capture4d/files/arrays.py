@@ -121,18 +121,20 @@ class ArrayFile:
         return Mesh(self[f"{prefix}vertices"], self[f"{prefix}faces"], self.get(f"{prefix}uv"))
 
 
-def map_array(path: str | Path) -> np.ndarray:
+def map_array(path: str | Path, *, absent: str = "no such file") -> np.ndarray:
     """The array of an npy file, read-only, which stays on disk until it is touched.
 
+    Args:
+        absent: what to say of a file that is not there.
     Raises:
         InputError: the file is missing or damaged.
     """
     path = Path(path)
-    with reading(path, "npy file"):
+    with reading(path, "npy file", absent=absent):
         with path.open("rb") as file:
             shape, _, dtype = _header(file)
             there = path.stat().st_size - file.tell()
-        if math.prod(shape) * dtype.itemsize != there:
+        if not shape or math.prod(shape) * dtype.itemsize != there:
             raise InputError(f"expected {shape} of {dtype}, {math.prod(shape) * dtype.itemsize} bytes, found {there}")
         return np.load(path, mmap_mode="r" if there else None, allow_pickle=False)
 

@@ -291,7 +291,7 @@ def _load_layout(file: TensorFile) -> ControlLayout:
         config = ControlConfig(**{**entry["config"], "lags": tuple(entry["config"].get("lags", ()))})
         joints, parents = (tuple(int(joint) for joint in entry[name]) for name in ("joints", "parents"))
         return ControlLayout(tuple(entry["joint_names"]), joints, float(entry["fps"]), config, parents)
-    except (KeyError, TypeError) as error:
-        raise InputError(f"damaged description of the controls ({error})", where=file.path) from None
     except SettingError as fault:
         raise fault.at(file.path) from None
+    except Exception as error:  # whatever such JSON may hold instead
+        raise InputError(f"damaged description of the controls ({error})", where=file.path) from None

@@ -12,6 +12,7 @@ from torch.nn import functional
 
 from capture4d.errors import InputError
 from capture4d.files.atomic import read_json
+from capture4d.files.reading import reading
 from capture4d.files.records import load_garment
 from capture4d.geometry.uv_raster import rasterise_uv
 from capture4d.runs.stage import require_complete
@@ -88,7 +89,5 @@ def read_map(path: Path) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         InputError: the file is missing or damaged.
     """
-    try:
+    with reading(path, "normal map"):
         return decode_png(path.read_bytes(), source=str(path))
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
