@@ -65,17 +65,17 @@ def open_sequence(path: Path) -> MeshSequence:
         return MeshSequence(path, dict.fromkeys(range(shape[0]), path), (vertices, faces))
     if not path.is_dir():
         found = "a file" if path.exists() else "nothing"
-        raise InputError(f"{path}: expected a folder of mesh files or an npz, found {found}")
+        raise InputError(f"expected a folder of mesh files or an npz, found {found}", where=path)
     files: dict[int, Path] = {}
     for file in sorted(path.iterdir()):
         if file.suffix.lower() not in MESH_SUFFIXES:
             continue
         numbers = re.findall(r"\d+", file.stem)
         if not numbers:
-            raise InputError(f"{file}: expected a frame number in the name, found none")
+            raise InputError("expected a frame number in the name, found none", where=file)
         other = files.setdefault(int(numbers[-1]), file)
         if other != file:
-            raise InputError(f"{file}: has the frame number {int(numbers[-1])} of {other.name}")
+            raise InputError(f"has the frame number {int(numbers[-1])} of {other.name}", where=file)
     if not files:
-        raise InputError(f"{path}: expected mesh files ({', '.join(MESH_SUFFIXES)}), found none")
+        raise InputError(f"expected mesh files ({', '.join(MESH_SUFFIXES)}), found none", where=path)
     return MeshSequence(path, dict(sorted(files.items())))

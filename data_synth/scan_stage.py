@@ -144,7 +144,7 @@ def _open_source(path: Path, config: ScanConfig) -> _Source:
 def _chosen_frames(sequence: MeshSequence, config: ScanConfig) -> tuple[int, ...]:
     chosen = sequence.frame_ids[config.first_frame :: config.step][: config.frames]
     if not chosen:
-        raise InputError(f"{sequence.path}: no frame left from number {config.first_frame} on")
+        raise InputError(f"no frame left from number {config.first_frame} on", where=sequence.path)
     return chosen
 
 
@@ -181,15 +181,17 @@ def _template(source: _Source, first: Mesh, path: Path | None) -> tuple[Garment,
         return Garment(mesh, dict(zip(names, boundary_loops(first.faces), strict=True))), *_own_vertices(first)
     if boundary_loops(mesh.faces) and not names:
         raise InputError(
-            f"{path}: expected a closed template, as the first mesh of {source.path} is; found one with open borders"
+            f"expected a closed template, as the first mesh of {source.path} is; found one with open borders",
+            where=path,
         )
     points, faces, barycentric = closest_points(first, mesh.vertices)
     distance = np.linalg.norm(points - mesh.vertices, axis=1).mean()
     size = np.ptp(first.vertices, axis=0).max()
     if distance > 0.01 * size:
         raise InputError(
-            f"{path}: expected a template that lies on the first mesh of {source.path}, or has its faces, "
-            f"found one that is {distance / size:.0%} of its size away"
+            f"expected a template that lies on the first mesh of {source.path}, or has its faces, "
+            f"found one that is {distance / size:.0%} of its size away",
+            where=path,
         )
     return Garment(mesh, _matched_loops(mesh, first, names)), faces, barycentric
 

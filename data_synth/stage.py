@@ -86,7 +86,7 @@ def open_take(output: Path, config: SynthConfig, *, overwrite: bool = False) -> 
     if config.motion.bvh is not None:
         path = Path(config.motion.bvh)
         if not path.is_file():
-            raise InputError(f"{path}: no such BVH file")
+            raise InputError("no such BVH file", where=path)
         upstream["bvh"] = file_digest([path], root=path.parent)
     return open_stage(output, name="synth", schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite)
 

@@ -69,7 +69,7 @@ def run(
     begin = time.process_time()
     if output_path.suffix.lower() not in MESH_SUFFIXES:
         raise InputError(
-            f"{output_path}: expected a mesh file ({', '.join(MESH_SUFFIXES)}), found '{output_path.suffix}'"
+            f"expected a mesh file ({', '.join(MESH_SUFFIXES)}), found '{output_path.suffix}'", where=output_path
         )
     template_file, scan_file = read_mesh(template_path), read_mesh(scan_path)
     result = register_mesh(

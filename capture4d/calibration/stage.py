@@ -134,7 +134,7 @@ def run_check(
     found = find_images(images, pattern)
     strangers = sorted({image.camera for image in found} - set(rig.names))
     if strangers:
-        raise InputError(f"{images}: expected cameras of {rig_path}, found {', '.join(strangers)}")
+        raise InputError(f"expected cameras of {rig_path}, found {', '.join(strangers)}", where=images)
     poses = sorted({image.pose for image in found}, key=_natural)
     detections = list(run_jobs(partial(_detect, geometry), found, workers=workers, label="find the board"))
     detections.sort(key=lambda detection: (detection.image.camera, _natural(detection.image.pose)))
@@ -142,7 +142,9 @@ def run_check(
         width, height = (int(size) for size in rig.image_sizes[rig.names.index(detection.image.camera)])
         if detection.size != (width, height):
             seen = "x".join(str(size) for size in detection.size)
-            raise InputError(f"{detection.image.path}: expected {width}x{height} pixels as in the rig, found {seen}")
+            raise InputError(
+                f"expected {width}x{height} pixels as in the rig, found {seen}", where=detection.image.path
+            )
     covariance = _read_covariance(rig_path.with_name(COVARIANCE), digest, cameras=len(rig.names))
     return check_rig(rig, _views(detections, rig.names, poses), geometry, covariance=covariance, config=config)
 
@@ -170,13 +172,13 @@ def find_images(folder: Path, pattern: str = PATTERN) -> list[BoardImage]:
     if sorted(re.findall(r"{(.*?)}", pattern)) != ["camera", "pose"]:
         raise InputError(f"--pattern: expected {{camera}} and {{pose}} once each, found '{pattern}'")
     if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder")
+        raise InputError("no such folder", where=folder)
     expression = re.escape(pattern.strip("/"))
     for name in ("camera", "pose"):
         expression = expression.replace(re.escape(f"{{{name}}}"), f"(?P<{name}>[^/]+?)")
     paths = [path for path in sorted(folder.rglob("*")) if path.suffix.lower() in ENDINGS and path.is_file()]
     if not paths:
-        raise InputError(f"{folder}: expected images ({', '.join(ENDINGS)}), found none")
+        raise InputError(f"expected images ({', '.join(ENDINGS)}), found none", where=folder)
     found: dict[tuple[str, str], BoardImage] = {}
     for path in paths:
         match = re.fullmatch(expression, path.relative_to(folder).with_suffix("").as_posix())
@@ -185,9 +187,9 @@ def find_images(folder: Path, pattern: str = PATTERN) -> list[BoardImage]:
         image = BoardImage(match["camera"], match["pose"], path)
         twin = found.setdefault((image.camera, image.pose), image)
         if twin is not image:
-            raise InputError(f"{path}: expected one image of a camera and a pose, found {twin.path} as well")
+            raise InputError(f"expected one image of a camera and a pose, found {twin.path} as well", where=path)
     if not found:
-        raise InputError(f"{paths[0]}: expected images that lie as --pattern '{pattern}' says, found none")
+        raise InputError(f"expected images that lie as --pattern '{pattern}' says, found none", where=paths[0])
     return sorted(found.values(), key=lambda image: (_natural(image.camera), _natural(image.pose)))
 
 
@@ -268,7 +270,7 @@ def _image_sizes(detections: Sequence[_Detection], names: Sequence[str]) -> np.n
         if detection.size != usual.size:
             expected, seen = ("x".join(str(size) for size in entry.size) for entry in (usual, detection))
             raise InputError(
-                f"{detection.image.path}: expected {expected} pixels as in {usual.image.path.name}, found {seen}"
+                f"expected {expected} pixels as in {usual.image.path.name}, found {seen}", where=detection.image.path
             )
     return np.array([first[name].size for name in names], np.int32)
 
@@ -297,7 +299,9 @@ def _read_covariance(path: Path, rig_digest: str, *, cameras: int) -> np.ndarray
             return None
         covariance = arrays["covariance"]
     if covariance.shape != (cameras, CAMERA_UNKNOWNS) * 2:
-        raise InputError(f"{path}: expected {cameras} x {CAMERA_UNKNOWNS} unknowns squared, found {covariance.shape}")
+        raise InputError(
+            f"expected {cameras} x {CAMERA_UNKNOWNS} unknowns squared, found {covariance.shape}", where=path
+        )
     return covariance
 
 

@@ -56,14 +56,14 @@ def write_fixed(checked: Checked, *, workers: int = 1) -> Path:
     """
     take, output = checked.take, fixed_path(checked.take.path)
     if output.exists():
-        raise InputError(f"{output}: already there, expected to write the corrected take there; remove it first")
+        raise InputError("already there, expected to write the corrected take there; remove it first", where=output)
     if checked.survey is None:
-        raise InputError(f"{take.path}: no readable frame, nothing to correct")
+        raise InputError("no readable frame, nothing to correct", where=take.path)
     placement = checked.survey.placement
     unusable = _unusable(checked)
     kept = [number for number in take.files if number not in unusable]
     if not kept:
-        raise InputError(f"{take.path}: no usable frame, nothing to correct")
+        raise InputError("no usable frame, nothing to correct", where=take.path)
     partial = output.with_name(f".{output.name}.partial")
     if partial.exists():  # of a run that was killed
         shutil.rmtree(partial)

@@ -46,7 +46,7 @@ def run(
         InputError: a file is missing or damaged, or the mesh cannot be a template.
     """
     if output.suffix.lower() != ".npz":
-        raise InputError(f"{output}: expected a template file .npz, found '{output.suffix}'")
+        raise InputError(f"expected a template file .npz, found '{output.suffix}'", where=output)
     if (mesh is None) == (region is None):
         raise InputError(f"template: expected a mesh or --region, found {'neither' if mesh is None else 'both'}")
     wearer = load_body(body) if body else load_anny()

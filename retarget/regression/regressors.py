@@ -277,10 +277,10 @@ def read_regressor(path: Path, kind: str, *, model_digest: str) -> tuple[TensorF
     """
     file = read_tensors(path, kind)
     if file.entry("model") != model_digest:
-        raise InputError(f"{path}: expected a regressor of the blendshapes beside it, found one of another model")
+        raise InputError("expected a regressor of the blendshapes beside it, found one of another model", where=path)
     for name, array in file.tensors.items():
         if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
-            raise InputError(f"{path}: expected finite numbers, found NaN or inf in '{name}'")
+            raise InputError(f"expected finite numbers, found NaN or inf in '{name}'", where=path)
     return file, _load_layout(file), Scales(file["control_mean"], file["control_std"], file["coefficient_std"])
 
 

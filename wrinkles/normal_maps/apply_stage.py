@@ -65,7 +65,7 @@ def run(model: Path, work: Path, config: ApplyConfig, *, workers: int = 1, overw
     template = MapTemplate.create(sequence.garment, generator.maps)
     if layout_digest(template.mesh, generator.maps.size) != generator.layout_digest:
         raise InputError(
-            f"{work}: expected the template that {weights} was trained on, found another mesh or UV layout"
+            f"expected the template that {weights} was trained on, found another mesh or UV layout", where=work
         )
     output = work / "wrinkles" / "generated"
     upstream = {"registration": digest, "model": file_digest([weights], root=weights.parent)}

@@ -116,12 +116,12 @@ def load_model(path: str | Path) -> WrinkleModel:
             architecture it claims.
     """
     if not Path(path).is_file():
-        raise InputError(f"{path}: no such file; run: capture4d wrinkles train WORK --output MODEL")
+        raise InputError("no such file; run: capture4d wrinkles train WORK --output MODEL", where=path)
     file = read_tensors(path, KIND)
     try:
         config, maps = NetworkConfig(**file.entry("network")), MapConfig(**file.entry("maps"))
     except (TypeError, ValueError) as error:
-        raise InputError(f"{path}: expected the settings of a wrinkle generator, found others ({error})") from None
+        raise InputError(f"expected the settings of a wrinkle generator, found others ({error})", where=path) from None
     with torch.device("meta"):
         generator = UNet(config)
     generator.to_empty(device="cpu")

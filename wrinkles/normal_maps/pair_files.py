@@ -68,13 +68,13 @@ def load_pairs(work: Path) -> PairTake:
         higher, known = read_map(path)
         if higher.shape != lower.shape or lower.shape != (low[0].shape if low else lower.shape):
             expected = " x ".join(str(side) for side in (low[0] if low else lower).shape[:2])
-            raise InputError(f"{path}: expected a map and a mask of {expected} texels, found "
-                             f"{' x '.join(str(side) for side in higher.shape[:2])}")  # fmt: skip
+            raise InputError(f"expected a map and a mask of {expected} texels, found "
+                             f"{' x '.join(str(side) for side in higher.shape[:2])}", where=path)  # fmt: skip
         low.append((lower * shown[..., None]).astype(np.float16))
         high.append((higher * known[..., None]).astype(np.float16))
         valid.append(known)
     if not paths:
-        raise InputError(f"{folder / 'high'}: expected maps, found none")
+        raise InputError("expected maps, found none", where=folder / "high")
     frame_ids = np.array([int(path.stem) for path in paths], np.int32)
 
     def stacked(images: list[np.ndarray]) -> torch.Tensor:

@@ -93,12 +93,12 @@ def _borrow(work: Path, lender: Path, config: PairConfig, *, overwrite: bool) ->
     template = MapTemplate.create(sequence.garment, config.map)
     lent = load_garment(pairs / "template.npz").template
     if layout_digest(lent, config.map.size) != layout_digest(template.mesh, config.map.size):
-        raise InputError(f"{lender}: expected maps of the template and layout of {work}, found others")
+        raise InputError(f"expected maps of the template and layout of {work}, found others", where=lender)
     template = template.referred_to(lent.vertices)
     rows = {int(frame_id): row for row, frame_id in enumerate(theirs.frame_ids)}
     shared = [(row, int(frame_id)) for row, frame_id in enumerate(sequence.frame_ids) if int(frame_id) in rows]
     if not shared:
-        raise InputError(f"{lender}: expected frames of {work}, found none of its {len(sequence.frame_ids)}")
+        raise InputError(f"expected frames of {work}, found none of its {len(sequence.frame_ids)}", where=lender)
     output = work / "wrinkles" / "pairs"
     sources = {"pairs": pairs}
     stage = open_stage(
@@ -118,7 +118,7 @@ def _borrow(work: Path, lender: Path, config: PairConfig, *, overwrite: bool) ->
         path = pairs / "high" / f"{frame_id:06d}.png"
         high, known = decode_png(path.read_bytes(), source=str(path))
         if high.shape[0] != template.raster.size:
-            raise InputError(f"{path}: expected a map of {template.raster.size} texels, found {high.shape[0]}")
+            raise InputError(f"expected a map of {template.raster.size} texels, found {high.shape[0]}", where=path)
         low = template.raster.image(template.low_normals(vertices) @ ours.astype(np.float32))
         write_bytes(stage.frame_path(frame_id, ".png", folder="low"), encode_png(low, shown))
         write_bytes(stage.frame_path(frame_id, ".png", folder="high"), encode_png(high @ turn, known))

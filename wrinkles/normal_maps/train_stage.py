@@ -81,7 +81,7 @@ def run(
     for work in works:
         if layout_digest(pair_template(work), map_settings(work).size) != digest:
             raise InputError(
-                f"{work}: expected the UV layout of {works[0]}, found another; one network needs one layout"
+                f"expected the UV layout of {works[0]}, found another; one network needs one layout", where=work
             )
     parts = [split(fitted(take, config.texels), held_out=config.held_out, gap=config.held_out_gap) for take in takes]
     consecutive_pairs([train for train, _ in parts])
