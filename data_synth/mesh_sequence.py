@@ -60,8 +60,8 @@ def open_sequence(path: Path) -> MeshSequence:
             shape = vertices.shape
             if len(shape) != 3 or shape[2] != 3 or not shape[0] or vertices.dtype.kind not in "iuf":
                 raise InputError(f"expected vertices of shape (frames, vertices, 3), found {shape} of {vertices.dtype}")
-            if faces.dtype.kind not in "iu":
-                raise InputError(f"expected whole numbers as faces, found {faces.dtype}")
+            if faces.dtype.kind not in "iu" or faces.ndim != 2 or faces.shape[1] != 3:
+                raise InputError(f"expected faces of shape (faces, 3), found {faces.shape} of {faces.dtype}")
         return MeshSequence(path, dict.fromkeys(range(shape[0]), path), (vertices, faces))
     if not path.is_dir():
         found = "a file" if path.exists() else "nothing"

@@ -52,7 +52,7 @@ def read_motion(path: Path, body: Body, *, fps: float | None = None) -> PoseSequ
     if not path.is_file():
         raise InputError("no such motion file", where=path)
     # Whether numbers are a motion shows when they are put on the body.
-    with reading(path, "motion file"), np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+    with reading(path, "motion file"):
         match path.suffix.lower():
             case ".bvh":
                 poses = _from_bvh(read_bvh(path), body)
@@ -103,9 +103,9 @@ def _from_npz(path: Path, body: Body) -> PoseSequence:
                 expected, found = len(body.joint_names), len(poses.joint_names)
                 raise InputError(f"expected the body's {expected} joints, found {found} others")
             return poses
-        vectors, trans = arrays["poses"].astype(np.float64), arrays["trans"].astype(np.float64)
+        vectors, trans = arrays.real("poses"), arrays.real("trans")
         rates = [arrays.number(name) for name in FRAME_RATES if name in arrays]
-        betas = arrays.get("betas")
+        betas = arrays.real("betas") if "betas" in arrays else None
         rest = _Rest.read(arrays)
     if vectors.ndim != 2 or vectors.shape[1] % 3 or vectors.shape[1] < 66 or trans.shape != (len(vectors), 3):
         found = f"{vectors.shape}, {trans.shape}"
@@ -180,7 +180,7 @@ class _Rest:
     def read(arrays: ArrayFile) -> _Rest | None:
         if "capture4d_turns" not in arrays:
             return None
-        turns, shifts, shape = (arrays[f"capture4d_{name}"] for name in ("turns", "shifts", "shape"))
+        turns, shifts, shape = (arrays.real(f"capture4d_{name}") for name in ("turns", "shifts", "shape"))
         return _Rest(arrays.names("capture4d_joint_names"), turns, shifts, shape)
 
     def arrays(self) -> dict[str, np.ndarray]:

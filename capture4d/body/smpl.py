@@ -86,7 +86,6 @@ def _read_fields(source: Path) -> dict[str, np.ndarray]:
     return found
 
 
-@np.errstate(over="ignore", invalid="ignore")  # NaN and infinity are found, and named, once they are a body
 def _assemble(fields: dict[str, np.ndarray]) -> Body:
     template = np.asarray(fields["v_template"], np.float64)
     shapes = np.moveaxis(np.asarray(fields["shapedirs"], np.float64), 2, 0)[:MAX_SHAPES]

@@ -47,18 +47,18 @@ class ArrayFile:
         self._path, self._data, self._kind = Path(path), data, kind
 
     def __enter__(self) -> ArrayFile:
-        with reading(self._path, self._kind):
+        with contextlib.ExitStack() as opened:
+            opened.enter_context(reading(self._path, self._kind))
             self._archive = zipfile.ZipFile(self._path if self._data is None else io.BytesIO(self._data))
             self._bytes = self._path.stat().st_size if self._data is None else len(self._data)
             found = [(info.filename.removesuffix(".npy"), info) for info in self._archive.infolist()]
             self._members = {name: info for name, info in found if name != info.filename}
+            self._opened = opened.pop_all()
         return self
 
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         self._archive.close()
-        if error is not None:
-            with reading(self._path, self._kind):
-                raise error
+        self._opened.__exit__(kind, error, trace)
 
     def __contains__(self, name: str) -> bool:
         return name in self._members
@@ -96,6 +96,13 @@ class ArrayFile:
             with contextlib.suppress(_NotPlainError):
                 found[name] = self[name]
         return {name: array for name, array in found.items() if array.dtype.kind in "biuf"}
+
+    def real(self, name: str) -> np.ndarray:
+        """An array of numbers, as float64."""
+        value = self[name]
+        if value.dtype.kind not in "iuf":
+            raise InputError(f"'{name}': expected numbers, found {value.dtype}", where=self._path)
+        return value.astype(np.float64)
 
     def number(self, name: str) -> float:
         """A single number; arrays of one will do."""

@@ -49,7 +49,6 @@ class _Primitive:
     """The accessors' numbers, for what is not read yet."""
 
 
-@np.errstate(over="ignore", invalid="ignore")  # NaN and infinity are found, and named, once they are a mesh
 def read_glb(path: Path) -> MeshFile:
     """Read a GLB file; `capture4d.files.meshes.read_mesh` is the way in.
 
@@ -59,7 +58,6 @@ def read_glb(path: Path) -> MeshFile:
     return _joined(list(_primitives(_open(path))))
 
 
-@np.errstate(over="ignore", invalid="ignore")
 def read_coloured_glb(path: Path) -> MeshFile:
     """The same, and colours from the base colour textures where the vertices have none."""
     document = _open(path)

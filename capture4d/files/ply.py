@@ -64,7 +64,6 @@ class _Element:
         self.properties.append((name, kind, length))
 
 
-@np.errstate(invalid="ignore")  # NaN and its kin are found, and named, once they are vertices or indices
 def read_ply(path: Path) -> MeshFile:
     """Read a PLY file; `capture4d.files.meshes.read_mesh` is the way in.
 

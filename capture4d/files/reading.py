@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from os import PathLike, fspath
 from pathlib import Path, PurePath, PureWindowsPath
 
+import numpy as np
+
 from capture4d.errors import InputError
 
 __all__ = ["companion", "one_line", "reading"]
@@ -30,7 +32,8 @@ def reading(path: str | PathLike[str], kind: str = "file", *, absent: str = "no 
         absent: what to say of a file that is not there.
     """
     try:
-        yield
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # no numbers are found by what checks them
+            yield
     except InputError as error:
         if error.where is not None:
             raise
