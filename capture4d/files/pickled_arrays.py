@@ -12,6 +12,7 @@ import codecs
 import io
 import math
 import pickletools
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -59,7 +60,8 @@ def read_pickled_arrays(path: Path) -> dict[str, np.ndarray]:
     Raises:
         InputError: the file is missing or damaged, holds no dictionary, or names anything but arrays.
     """
-    with reading(path, "pickle of arrays"):
+    with reading(path, "pickle of arrays"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of odd escapes in its text
         found = _Machine(path.read_bytes()).run()
         if not isinstance(found, dict):
             raise InputError(f"expected a dictionary of arrays, found {type(found).__name__}")

@@ -140,7 +140,7 @@ def _header(head: bytes) -> tuple[list[_Element], str]:
                 case ["property", kind, name]:
                     elements[-1].add(name, _TYPES[kind], "")
         except (KeyError, ValueError, IndexError):
-            raise InputError(f"damaged header, cannot read '{line.strip()}'") from None
+            raise InputError(f"damaged header, cannot read '{line.strip()[:80]}'") from None
     if order is None or not elements:
         raise InputError("cut off in the header")
     return elements, order

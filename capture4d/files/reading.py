@@ -12,7 +12,7 @@ import numpy as np
 
 from capture4d.errors import InputError
 
-__all__ = ["companion", "one_line", "reading"]
+__all__ = ["companion", "one_line", "reading", "shortened"]
 
 _ABSENT = (errno.ENOENT, errno.ENOTDIR)
 _MEANT_OF_THE_CONTENT = (errno.EINVAL, errno.EOVERFLOW)
@@ -37,6 +37,7 @@ def reading(path: str | PathLike[str], kind: str = "file", *, absent: str = "no 
     except InputError as error:
         if error.where is not None:
             raise
+        error.reason = shortened(error.reason)
         raise error.at(path) from None
     except Warning:  # one that was made an exception says something about us, not about the file
         raise
@@ -54,7 +55,12 @@ def reading(path: str | PathLike[str], kind: str = "file", *, absent: str = "no 
 
 def one_line(error: BaseException) -> str:
     """What an exception says, without its line breaks and at most 200 characters of it."""
-    return " ".join(f"{error}".split())[:200] or type(error).__name__
+    return shortened(" ".join(f"{error}".split()), 200) or type(error).__name__
+
+
+def shortened(text: str, most: int = 500) -> str:
+    """A text that a message can hold: what a file has in it may be of any length."""
+    return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
 def companion(path: Path, name: str, what: str) -> Path:

@@ -9,6 +9,7 @@ import tempfile
 import tracemalloc
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -290,18 +291,15 @@ def smpl_body() -> tuple[Body, PoseSequence]:
 SMPL_BODY, SMPL_POSES = smpl_body()
 
 
-@pytest.fixture(scope="module")
-def samples() -> dict[str, dict[str, bytes]]:
-    """A whole file of each kind, and what lies beside it."""
-    found = {}
-    for kind in KINDS:
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / kind.name
-            path.parent.mkdir(exist_ok=True)
-            kind.make(path)
-            files = (file for file in Path(folder).rglob("*") if file.is_file())
-            found[kind.name] = {file.relative_to(folder).as_posix(): file.read_bytes() for file in files}
-    return found
+@lru_cache
+def whole(name: str) -> dict[str, bytes]:
+    """A file of a kind, and what lies beside it."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / name
+        path.parent.mkdir(exist_ok=True)
+        BY_NAME[name].make(path)
+        files = (file for file in Path(folder).rglob("*") if file.is_file())
+        return {file.relative_to(folder).as_posix(): file.read_bytes() for file in files}
 
 
 @contextlib.contextmanager
@@ -336,14 +334,14 @@ def value_or_one_line(kind: Kind, files: dict[str, bytes]) -> str:
 
 
 @pytest.mark.parametrize("name", BY_NAME)
-def test_a_whole_file_has_a_value(name: str, samples: dict[str, dict[str, bytes]]) -> None:
+def test_a_whole_file_has_a_value(name: str) -> None:
     if name != "other.bvh":  # which lacks most joints
-        assert value_or_one_line(BY_NAME[name], samples[name]) == ""
+        assert value_or_one_line(BY_NAME[name], whole(name)) == ""
 
 
 @pytest.mark.parametrize("name", BY_NAME)
-def test_a_missing_file_is_named(name: str, samples: dict[str, dict[str, bytes]]) -> None:
-    files = {file: data for file, data in samples[name].items() if file != name}
+def test_a_missing_file_is_named(name: str) -> None:
+    files = {file: data for file, data in whole(name).items() if file != name}
     said = value_or_one_line(BY_NAME[name], files)
     optional = name in ("truth/model.npz", "frames.bin", "frames.txt")
     assert (said == "") if optional else ("no such" in said or "found nothing" in said or "found none" in said)
@@ -400,13 +398,11 @@ def damaged(data: bytes, how: str, place: float, with_what: Any) -> bytes:
 @pytest.mark.parametrize("name", BY_NAME)
 @given(damages=st.lists(DAMAGE, min_size=1, max_size=3))
 @settings(max_examples=60, deadline=None)
-def test_a_damaged_file_has_a_value_or_is_named(
-    name: str, samples: dict[str, dict[str, bytes]], damages: list[tuple[str, float, Any]]
-) -> None:
-    data = samples[name][name]
+def test_a_damaged_file_has_a_value_or_is_named(name: str, damages: list[tuple[str, float, Any]]) -> None:
+    data = whole(name)[name]
     for damage in damages:
         data = damaged(data, *damage)
-    value_or_one_line(BY_NAME[name], samples[name] | {name: data})
+    value_or_one_line(BY_NAME[name], whole(name) | {name: data})
 
 
 ARCHIVES = [name for name in BY_NAME if name.endswith(".npz")]
@@ -436,8 +432,8 @@ CHANGES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 
 @pytest.mark.parametrize("name", ARCHIVES)
-def test_arrays_of_another_kind_have_a_value_or_are_named(name: str, samples: dict[str, dict[str, bytes]]) -> None:
-    with np.load(io.BytesIO(samples[name][name]), allow_pickle=False) as archive:
+def test_arrays_of_another_kind_have_a_value_or_are_named(name: str) -> None:
+    with np.load(io.BytesIO(whole(name)[name]), allow_pickle=False) as archive:
         arrays = dict(archive)
     changes = list(CHANGES.values())
     for row, changed in enumerate(arrays):
@@ -445,7 +441,7 @@ def test_arrays_of_another_kind_have_a_value_or_are_named(name: str, samples: di
             others = {key: value for key, value in arrays.items() if key != changed}
             stream = io.BytesIO()
             np.savez(stream, **others, **({} if change is None else {changed: change(arrays[changed])}))
-            value_or_one_line(BY_NAME[name], samples[name] | {name: stream.getvalue()})
+            value_or_one_line(BY_NAME[name], whole(name) | {name: stream.getvalue()})
 
 
 @pytest.mark.parametrize("name", ["rig.json", "any.json", "rows.jsonl", "capture.json"])
@@ -481,13 +477,13 @@ def test_arrays_of_another_kind_have_a_value_or_are_named(name: str, samples: di
     )
 )
 @settings(max_examples=150, deadline=None)
-def test_json_of_any_shape_has_a_value_or_is_named(name: str, samples: dict[str, dict[str, bytes]], value: Any) -> None:
+def test_json_of_any_shape_has_a_value_or_is_named(name: str, value: Any) -> None:
     import json
 
-    value_or_one_line(BY_NAME[name], samples[name] | {name: json.dumps(value).encode()})
+    value_or_one_line(BY_NAME[name], whole(name) | {name: json.dumps(value).encode()})
 
 
-def test_json_of_any_depth_is_named(samples: dict[str, dict[str, bytes]]) -> None:
+def test_json_of_any_depth_is_named() -> None:
     for name in ("rig.json", "any.json", "rows.jsonl", "capture.json"):
         for text in (b"[" * 100_000, b'{"a":' * 100_000 + b"1" + b"}" * 100_000):
-            assert "not valid JSON" in value_or_one_line(BY_NAME[name], samples[name] | {name: text})
+            assert "not valid JSON" in value_or_one_line(BY_NAME[name], whole(name) | {name: text})
