@@ -128,7 +128,7 @@ def _require_surface(mesh: Mesh, source: str) -> None:
     edges, uses = edge_uses(mesh.faces)
     if (edges[:, 0] == edges[:, 1]).any():
         bad = int(np.flatnonzero((np.diff(np.sort(mesh.faces, axis=1), axis=1) == 0).any(axis=1))[0])
-        raise InputError(f"{source}: expected three different corners in every face, face {bad} uses one twice")
+        raise InputError(f"expected three different corners in every face, face {bad} uses one twice", where=source)
     if (uses > 2).any():
         count = int((uses > 2).sum())
         raise InputError(

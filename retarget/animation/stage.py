@@ -22,6 +22,7 @@ from capture4d.body.motion_files import read_motion, resample
 from capture4d.body.skinning import ShapedBody
 from capture4d.captures.work_folder import ANIMATE, VERDICTS, stack_vertices
 from capture4d.errors import InputError
+from capture4d.files.arrays import map_array
 from capture4d.files.atomic import file_digest, read_json, write_json, write_json_lines, write_npy, write_npz
 from capture4d.files.records import load_body, load_poses, save_body, save_garment, save_poses
 from capture4d.runs.stage import Stage, StageResult, open_stage
@@ -79,7 +80,7 @@ def run(
     stage = _open(output, scene, config, digest, overwrite)
     path = stage.path / "coefficients.npy"
     if path.is_file():
-        coefficients = np.load(path, allow_pickle=False)
+        coefficients = map_array(path)
     else:
         regressor = known.regressors[name]
         coefficients = regressor.predict(control_vectors(regressor.layout, scene.motion))
