@@ -19,16 +19,18 @@ class InputError(ValueError):
     Attributes:
         reason: the message without the file.
         where: the file or folder that the message begins with, None if it names none.
+        line: the line of that file, None if it names none.
     """
 
-    def __init__(self, reason: str, *, where: str | PathLike[str] | None = None) -> None:
-        self.reason, self.where = reason, None if where is None else fspath(where)
-        super().__init__(reason if self.where is None else f"{self.where}: {reason}")
+    def __init__(self, reason: str, *, where: str | PathLike[str] | None = None, line: int | None = None) -> None:
+        self.reason, self.where, self.line = reason, None if where is None else fspath(where), line
+        place = "" if self.where is None else f"{self.where}: " if line is None else f"{self.where}:{line}: "
+        super().__init__(f"{place}{reason}")
 
     def at(self: Fault, where: str | PathLike[str]) -> Fault:
         """The same fault, of that file or folder instead of the one it named."""
         moved = copy(self)
-        InputError.__init__(moved, self.reason, where=where)
+        InputError.__init__(moved, self.reason, where=where, line=self.line)
         return moved
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -50,6 +52,6 @@ class StaleError(InputError):
 
 def _rebuilt(kind: type[InputError], state: dict[str, Any]) -> InputError:
     error = kind.__new__(kind)
-    InputError.__init__(error, state["reason"], where=state["where"])
+    InputError.__init__(error, state["reason"], where=state["where"], line=state["line"])
     error.__dict__.update(state)
     return error

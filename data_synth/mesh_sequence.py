@@ -43,9 +43,10 @@ class MeshSequence:
             return read_mesh(path).mesh
         vertices, faces = self.arrays
         try:
-            return Mesh(vertices[frame_id].astype(np.float32), faces.astype(np.int32))
+            with np.errstate(over="ignore", invalid="ignore"):  # what is no number is found in the mesh
+                return Mesh(vertices[frame_id].astype(np.float32), faces.astype(np.int32))
         except InputError as error:
-            raise InputError(f"{path}: frame {frame_id}: {error}") from None
+            raise InputError(f"frame {frame_id}: {error.reason}", where=path) from None
 
     def digest(self) -> str:
         return file_digest(set(self.files.values()), root=self.path if self.path.is_dir() else self.path.parent)
@@ -60,23 +61,25 @@ def open_sequence(path: Path) -> MeshSequence:
     if path.is_file() and path.suffix == ".npz":
         with ArrayFile(path) as arrays:
             vertices, faces = arrays["vertices"], arrays["faces"]
-        shape = vertices.shape
-        if len(shape) != 3 or shape[2] != 3 or not shape[0]:
-            raise InputError(f"{path}: expected vertices of shape (frames, vertices, 3), found {shape}")
+            shape = vertices.shape
+            if len(shape) != 3 or shape[2] != 3 or not shape[0] or vertices.dtype.kind not in "iuf":
+                raise InputError(f"expected vertices of shape (frames, vertices, 3), found {shape} of {vertices.dtype}")
+            if faces.dtype.kind not in "iu" or faces.ndim != 2 or faces.shape[1] != 3:
+                raise InputError(f"expected faces of shape (faces, 3), found {faces.shape} of {faces.dtype}")
         return MeshSequence(path, dict.fromkeys(range(shape[0]), path), (vertices, faces))
     if not path.is_dir():
         found = "a file" if path.exists() else "nothing"
-        raise InputError(f"{path}: expected a folder of mesh files or an npz, found {found}")
+        raise InputError(f"expected a folder of mesh files or an npz, found {found}", where=path)
     files: dict[int, Path] = {}
     for file in sorted(path.iterdir()):
         if file.suffix.lower() not in MESH_SUFFIXES:
             continue
         numbers = re.findall(r"\d+", file.stem)
         if not numbers:
-            raise InputError(f"{file}: expected a frame number in the name, found none")
+            raise InputError("expected a frame number in the name, found none", where=file)
         other = files.setdefault(int(numbers[-1]), file)
         if other != file:
-            raise InputError(f"{file}: has the frame number {int(numbers[-1])} of {other.name}")
+            raise InputError(f"has the frame number {int(numbers[-1])} of {other.name}", where=file)
     if not files:
-        raise InputError(f"{path}: expected mesh files ({', '.join(MESH_SUFFIXES)}), found none")
+        raise InputError(f"expected mesh files ({', '.join(MESH_SUFFIXES)}), found none", where=path)
     return MeshSequence(path, dict(sorted(files.items())))

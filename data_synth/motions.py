@@ -124,8 +124,8 @@ def make_motion(
         poses = retarget(shaped, read_bvh(Path(config.bvh)), fps, first_frame=config.skip_frames)
         if len(poses.frame_ids) < frames:
             raise InputError(
-                f"{config.bvh}: expected at least {wanted} frames at {fps:g} fps, "
-                f"found {config.skip_frames + len(poses.frame_ids)}"
+                f"expected at least {wanted} frames at {fps:g} fps, found {config.skip_frames + len(poses.frame_ids)}",
+                where=config.bvh,
             )
         return _cut(poses, 0, frames, reverse=config.reverse)
     if config.clip == "sampled":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -13,7 +12,8 @@ import numpy as np
 from capture4d.captures.capture import Capture, write_capture_description, write_scan
 from capture4d.captures.truth import TruthFrame, TruthModel, write_truth_frame, write_truth_model
 from capture4d.errors import InputError
-from capture4d.files.atomic import file_digest, write_json, write_npz
+from capture4d.files.arrays import ArrayFile
+from capture4d.files.atomic import file_digest, read_json, write_json, write_npz
 from capture4d.files.records import load_rig, save_body, save_garment, save_poses, save_rig
 from capture4d.runs.stage import Stage, StageResult, open_stage
 from capture4d.runs.workers import run_jobs
@@ -91,7 +91,7 @@ def open_take(output: Path, config: SynthConfig, *, overwrite: bool = False) -> 
     if config.motion.bvh is not None:
         path = Path(config.motion.bvh)
         if not path.is_file():
-            raise InputError(f"{path}: no such BVH file")
+            raise InputError("no such BVH file", where=path)
         upstream["bvh"] = file_digest([path], root=path.parent)
     return open_stage(output, name="synth", schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite)
 
@@ -234,7 +234,7 @@ def open_scene(stage: Stage, config: SynthConfig) -> Scene:
 def scan_frame(scene: Scene, job: ScanJob) -> int:
     """Scan a simulated frame and write its truth; its number."""
     take, folder, frame_id, config = scene.plan, job.stage.path, job.frame_id, job.config
-    with np.load(folder / "cloth" / f"{frame_id:06d}.npz", allow_pickle=False) as cloth:
+    with ArrayFile(folder / "cloth" / f"{frame_id:06d}.npz") as cloth:
         fine, surface = cloth["vertices"], cloth["body"]
     labels = np.zeros(0, np.uint8)
     if config.scans:
@@ -261,8 +261,7 @@ def _write_quality(stage: Stage, frame_ids: list[int]) -> None:
     if path.exists():
         return
     rows = [
-        {"frame_id": frame_id, **json.loads((stage.path / "cloth" / f"{frame_id:06d}.json").read_text())}
-        for frame_id in frame_ids
+        {"frame_id": frame_id, **read_json(stage.path / "cloth" / f"{frame_id:06d}.json")} for frame_id in frame_ids
     ]
     write_json(path, rows)
     bad = [row for row in rows if row["reasons"]]

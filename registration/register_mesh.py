@@ -6,7 +6,6 @@ of a shirt, for which the constants are made. Units therefore change the numbers
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from jaxtyping import Float32, Float64
 
 from capture4d.colours.spaces import parse_colour
 from capture4d.errors import InputError
-from capture4d.files.atomic import write_json
+from capture4d.files.atomic import nan_to_none, write_json
 from capture4d.files.meshes import MESH_SUFFIXES, read_mesh, write_mesh
 from capture4d.geometry.mesh import boundary_loops, submesh
 from capture4d.types import Garment, GarmentScan, Mesh
@@ -70,7 +69,7 @@ def run(
     begin = time.process_time()
     if output_path.suffix.lower() not in MESH_SUFFIXES:
         raise InputError(
-            f"{output_path}: expected a mesh file ({', '.join(MESH_SUFFIXES)}), found '{output_path.suffix}'"
+            f"expected a mesh file ({', '.join(MESH_SUFFIXES)}), found '{output_path.suffix}'", where=output_path
         )
     template_file, scan_file = read_mesh(template_path), read_mesh(scan_path)
     result = register_mesh(
@@ -85,7 +84,7 @@ def run(
     mesh = template_file.mesh.with_vertices(result.vertices)
     write_mesh(output_path, mesh, polygon_sizes=template_file.polygon_sizes)
     units = config.units if config.units != "auto" else guess_units(template_file.mesh)
-    numbers = {key: value if math.isfinite(value) else None for key, value in result.quality.numbers.items()}
+    numbers = nan_to_none(result.quality.numbers)
     write_json(
         output_path.with_suffix(".json"),
         {

@@ -11,8 +11,6 @@ metrics.jsonl             the frames' metrics, one per line
 
 from __future__ import annotations
 
-import json
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,7 +28,8 @@ from capture4d.captures.work_folder import (
     tracking_digest,
 )
 from capture4d.errors import InputError
-from capture4d.files.atomic import read_json, write_bytes, write_json, write_npz
+from capture4d.files.arrays import ArrayFile
+from capture4d.files.atomic import nan_to_none, read_json, write_json, write_json_lines, write_npz
 from capture4d.files.records import save_garment
 from capture4d.runs.stage import Stage, StageResult, open_stage, require_complete
 from capture4d.runs.workers import run_jobs, shared
@@ -136,7 +135,7 @@ def _register_segment(take: _Take, positions: range) -> int:
     def done(frame_id: int) -> tuple[np.ndarray, bool] | None:
         if frame_id in pending:
             return None
-        with np.load(stage.frame_path(frame_id), allow_pickle=False) as arrays:
+        with ArrayFile(stage.frame_path(frame_id)) as arrays:
             return arrays["vertices"], VERDICTS[int(arrays["verdict"])] != "failed"
 
     results = register_run(
@@ -157,7 +156,7 @@ def _register_segment(take: _Take, positions: range) -> int:
 
 def _write_frame(stage: Stage, result: FrameResult) -> None:
     """Metrics first: the frame counts as done once its npz is there."""
-    numbers = {key: value if math.isfinite(value) else None for key, value in result.quality.numbers.items()}
+    numbers = nan_to_none(result.quality.numbers)
     write_json(
         _metrics_path(stage, result.frame_id),
         {
@@ -185,5 +184,5 @@ def _metrics_path(stage: Stage, frame_id: int) -> Path:
 def _gather(stage: Stage, frame_ids: tuple[int, ...]) -> None:
     """Stack the frames and their metrics."""
     stack_vertices(stage, frame_ids)
-    lines = [json.dumps(read_json(_metrics_path(stage, frame_id))) for frame_id in frame_ids]
-    write_bytes(stage.path / "metrics.jsonl", ("\n".join(lines) + "\n").encode())
+    records = (read_json(_metrics_path(stage, frame_id)) for frame_id in frame_ids)
+    write_json_lines(stage.path / "metrics.jsonl", records)

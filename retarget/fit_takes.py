@@ -18,6 +18,7 @@ from jaxtyping import Float32
 from capture4d.body.skinning import with_shape
 from capture4d.captures.work_folder import VERDICTS, WorkFolder, load_registration
 from capture4d.errors import InputError
+from capture4d.files.arrays import map_array
 from capture4d.files.atomic import read_json, write_json, write_npy, write_npy_rows
 from capture4d.files.records import load_garment
 from capture4d.runs.workers import run_jobs
@@ -153,7 +154,7 @@ def stack_takes(takes: Sequence[RegisteredTake], folder: Path) -> UnposedTakes:
     Raises:
         InputError: there are not two good frames.
     """
-    parts = [np.load(_vertices_path(folder, take), mmap_mode="r", allow_pickle=False) for take in takes]
+    parts = [map_array(_vertices_path(folder, take)) for take in takes]
     path = folder / "unposed" / "all.npy"
     if not path.is_file():
         write_npy_rows(path, (row for part in parts for row in part), count=sum(map(len, parts)))
@@ -162,10 +163,10 @@ def stack_takes(takes: Sequence[RegisteredTake], folder: Path) -> UnposedTakes:
     if good < 2:
         frames = sum(len(take.good) for take in unposed)
         raise InputError(f"takes: expected at least 2 good frames to learn from, found {good} of {frames}")
-    weights = np.concatenate([np.load(_weights_path(folder, take), allow_pickle=False) for take in takes])
+    weights = np.concatenate([map_array(_weights_path(folder, take)) for take in takes])
     skin_weights = takes[0].garment.skin_weights
     assert skin_weights is not None
-    return UnposedTakes(unposed, np.load(path, mmap_mode="r", allow_pickle=False), weights, skin_weights)
+    return UnposedTakes(unposed, map_array(path), weights, skin_weights)
 
 
 def _unposed(take: RegisteredTake, record: dict[str, list]) -> Take:

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from capture4d.errors import InputError
+from capture4d.files.reading import one_line, reading
 
 __all__ = ["Bvh", "format_bvh", "read_bvh"]
 
@@ -51,23 +52,72 @@ def read_bvh(path: Path) -> Bvh:
     Raises:
         InputError: missing file, or a line that does not fit the format; names file and line.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: no such BVH file")
-    lines = path.read_text(errors="replace").splitlines()
-    names, parents, offsets, channels, stack = [], [], [], [], []
-    number, in_end_site, motion_at, pending = 0, False, None, None
+    with reading(path, "BVH file", absent="no such BVH file"):
+        return _parsed(path, path.read_text(encoding="utf-8", errors="replace").splitlines())
+
+
+def _parsed(path: Path, lines: list[str]) -> Bvh:
+    tree, motion_at = _joint_tree(lines)
+    width = sum(len(each) for each in tree.channels)
+    number = motion_at + 1
+    rows = []
+    try:
+        count = int(lines[motion_at].split(":")[1])
+        if count < 1:
+            raise InputError(f"expected at least one frame, found {count}")
+        number = motion_at + 2
+        frame_time = float(lines[motion_at + 1].split(":")[1])
+        if not 0 < frame_time < np.inf:
+            raise InputError(f"expected a positive frame time, found {frame_time:g}")
+        for number in range(motion_at + 3, motion_at + 3 + count):
+            row = [float(word) for word in lines[number - 1].split()]
+            if len(row) != width:
+                raise InputError(f"expected {width} channel values, found {len(row)}")
+            rows.append(row)
+    except (ValueError, IndexError) as error:
+        raise _at_line(number, error) from None
+    values = np.array(rows)
+    if not np.isfinite(values).all() or not np.isfinite(tree.offsets).all():
+        raise InputError("expected finite channel values and offsets, found NaN or infinity")
+    local, column, positions = [], 0, np.zeros((count, 3))
+    for joint, each in enumerate(tree.channels):
+        block = dict(zip(each, values[:, column : column + len(each)].T, strict=True))
+        column += len(each)
+        order = "".join(name[0] for name in each if name.endswith("rotation"))
+        angles = np.stack([block[f"{axis}rotation"] for axis in order], axis=1) if order else np.zeros((count, 3))
+        local.append(Rotation.from_euler(order or "XYZ", angles, degrees=True).as_quat())
+        if joint == 0 and all(f"{axis}position" in block for axis in "XYZ"):
+            positions = np.stack([block[f"{axis}position"] for axis in "XYZ"], axis=1)
+    rotations = Rotation.from_quat(np.stack(local, axis=1).reshape(-1, 4))
+    return Bvh(
+        path, tuple(tree.names), np.array(tree.parents), np.array(tree.offsets), rotations, positions, frame_time
+    )
+
+
+@dataclass(slots=True, eq=False)
+class _Tree:
+    """The joints as they are met, each after its parent."""
+
+    names: list[str]
+    parents: list[int]
+    offsets: list[tuple[float, ...]]
+    channels: list[list[str]]
+
+
+def _joint_tree(lines: list[str]) -> tuple[_Tree, int]:
+    """The joints, and the number of the line that ends them."""
+    tree, stack = _Tree([], [], [], []), []
+    number, in_end_site, pending = 0, False, None
     try:
         for number, line in enumerate(lines, start=1):
             words = line.split()
-            if not words:
-                continue
-            match words[0]:
+            match words[0] if words else "":
                 case "ROOT" | "JOINT":
-                    names.append(words[1])
-                    parents.append(stack[-1] if stack else -1)
-                    offsets.append((0.0, 0.0, 0.0))
-                    channels.append([])
-                    pending = len(names) - 1
+                    tree.names.append(words[1])
+                    tree.parents.append(stack[-1] if stack else -1)
+                    tree.offsets.append((0.0, 0.0, 0.0))
+                    tree.channels.append([])
+                    pending = len(tree.names) - 1
                 case "End":
                     in_end_site, pending = True, -1
                 case "{":
@@ -78,53 +128,24 @@ def read_bvh(path: Path) -> Bvh:
                     in_end_site = False
                     stack.pop()
                 case "OFFSET" if not in_end_site:
-                    offsets[stack[-1]] = tuple(float(word) for word in words[1:4])
+                    x, y, z = (float(word) for word in words[1:4])
+                    tree.offsets[stack[-1]] = (x, y, z)
                 case "CHANNELS":
-                    channels[stack[-1]] = words[2 : 2 + int(words[1])]
-                    if not set(channels[stack[-1]]) <= CHANNELS:
+                    tree.channels[stack[-1]] = words[2 : 2 + int(words[1])]
+                    if not set(tree.channels[stack[-1]]) <= CHANNELS:
                         raise ValueError(f"expected channels {', '.join(sorted(CHANNELS))}")
                 case "MOTION":
-                    motion_at = number
-                    break
-        if motion_at is None:
-            raise InputError(f"{path}: expected a MOTION section, found the end of the file at line {number}")
-        if not names:
-            raise InputError(f"{path}: expected a joint tree, found a MOTION section without one")
-        number = motion_at + 1
-        count = int(lines[motion_at].split(":")[1])
-        if count < 1:
-            raise InputError(f"{path}, line {number}: expected at least one frame, found {count}")
-        number = motion_at + 2
-        frame_time = float(lines[motion_at + 1].split(":")[1])
-        if not 0 < frame_time < np.inf:
-            raise InputError(f"{path}, line {number}: expected a positive frame time, found {frame_time:g}")
-        width = sum(len(each) for each in channels)
-        rows = []
-        for number in range(motion_at + 3, motion_at + 3 + count):
-            row = [float(word) for word in lines[number - 1].split()]
-            if len(row) != width:
-                raise InputError(f"{path}, line {number}: expected {width} channel values, found {len(row)}")
-            rows.append(row)
+                    if not tree.names:
+                        raise InputError("expected a joint tree, found a MOTION section without one")
+                    return tree, number
     except (ValueError, IndexError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{path}, line {number}: not a BVH file, or cut short ({error})") from None
-    values = np.array(rows)
-    if not np.isfinite(values).all():
-        raise InputError(f"{path}: expected finite channel values, found NaN or infinity")
-    local, column, positions = [], 0, np.zeros((count, 3))
-    for joint, each in enumerate(channels):
-        block = dict(zip(each, values[:, column : column + len(each)].T, strict=True))
-        column += len(each)
-        order = "".join(name[0] for name in each if name.endswith("rotation"))
-        angles = np.stack([block[f"{axis}rotation"] for axis in order], axis=1) if order else np.zeros((count, 3))
-        local.append(Rotation.from_euler(order or "XYZ", angles, degrees=True).as_quat())
-        if joint == 0 and all(f"{axis}position" in block for axis in "XYZ"):
-            positions = np.stack([block[f"{axis}position"] for axis in "XYZ"], axis=1)
-    quaternions = np.stack(local, axis=1).reshape(-1, 4)
-    return Bvh(
-        path, tuple(names), np.array(parents), np.array(offsets), Rotation.from_quat(quaternions), positions, frame_time
-    )
+        raise _at_line(number, error) from None
+    raise InputError(f"expected a MOTION section, found the end of the file at line {number}")
+
+
+def _at_line(number: int, error: Exception) -> InputError:
+    said = error.reason if isinstance(error, InputError) else f"not a BVH file, or cut short ({one_line(error)})"
+    return InputError(f"line {number}: {said}")
 
 
 def format_bvh(motion: Bvh, end_offsets: Float[np.ndarray, "joints 3"]) -> str:

@@ -26,6 +26,7 @@ from capture4d.body.skinning import ShapedBody, with_shape
 from capture4d.errors import InputError
 from capture4d.files.arrays import ArrayFile
 from capture4d.files.atomic import write_bytes, write_npz
+from capture4d.files.reading import reading
 from capture4d.files.records import load_poses, save_poses
 from capture4d.types import Body, PoseSequence
 
@@ -49,14 +50,16 @@ def read_motion(path: Path, body: Body, *, fps: float | None = None) -> PoseSequ
         InputError: an unknown kind of file, a damaged one, or joints that have no counterpart in the body.
     """
     if not path.is_file():
-        raise InputError(f"{path}: no such motion file")
-    match path.suffix.lower():
-        case ".bvh":
-            poses = _from_bvh(read_bvh(path), body)
-        case ".npz":
-            poses = _from_npz(path, body)
-        case other:
-            raise InputError(f"{path}: expected a motion file .npz or .bvh, found '{other}'")
+        raise InputError("no such motion file", where=path)
+    # Whether numbers are a motion shows when they are put on the body.
+    with reading(path, "motion file"):
+        match path.suffix.lower():
+            case ".bvh":
+                poses = _from_bvh(read_bvh(path), body)
+            case ".npz":
+                poses = _from_npz(path, body)
+            case other:
+                raise InputError(f"expected a motion file .npz or .bvh, found '{other}'")
     return poses if fps is None else resample(poses, fps)
 
 
@@ -68,7 +71,7 @@ def write_motion(path: Path, body: Body, poses: PoseSequence, *, amass: bool = F
         case ".npz":
             write_amass(path, body, poses) if amass else save_poses(path, poses)
         case other:
-            raise InputError(f"{path}: expected a motion file .npz or .bvh, found '{other}'")
+            raise InputError(f"expected a motion file .npz or .bvh, found '{other}'", where=path)
 
 
 def resample(poses: PoseSequence, fps: float) -> PoseSequence:
@@ -94,25 +97,30 @@ def resample(poses: PoseSequence, fps: float) -> PoseSequence:
 
 def _from_npz(path: Path, body: Body) -> PoseSequence:
     with ArrayFile(path) as arrays:
-        if arrays.get("poses") is None:
+        if "poses" not in arrays:
             poses = load_poses(path)
             if poses.joint_names != body.joint_names:
                 expected, found = len(body.joint_names), len(poses.joint_names)
-                raise InputError(f"{path}: expected the body's {expected} joints, found {found} others")
+                raise InputError(f"expected the body's {expected} joints, found {found} others")
             return poses
-        vectors, trans = arrays["poses"].astype(np.float64), arrays["trans"].astype(np.float64)
-        rates = [found for name in FRAME_RATES if (found := arrays.get(name)) is not None]
-        betas = arrays.get("betas")
+        vectors, trans = arrays.real("poses"), arrays.real("trans")
+        rates = [arrays.number(name) for name in FRAME_RATES if name in arrays]
+        betas = arrays.real("betas") if "betas" in arrays else None
         rest = _Rest.read(arrays)
     if vectors.ndim != 2 or vectors.shape[1] % 3 or vectors.shape[1] < 66 or trans.shape != (len(vectors), 3):
         found = f"{vectors.shape}, {trans.shape}"
-        raise InputError(f"{path}: expected poses (T, 66 or more) and trans (T, 3), found {found}")
+        raise InputError(f"expected poses (T, 66 or more) and trans (T, 3), found {found}")
     if not rates:
-        raise InputError(f"{path}: expected a frame rate as {' or '.join(FRAME_RATES)}, found none")
+        raise InputError(f"expected a frame rate as {' or '.join(FRAME_RATES)}, found none")
+    if not 0 < rates[0] < np.inf:
+        raise InputError(f"expected a positive frame rate, found {rates[0]:g}")
+    wrong = np.flatnonzero(~(np.isfinite(vectors).all(axis=1) & np.isfinite(trans).all(axis=1)))
+    if len(wrong):
+        raise InputError(f"expected finite poses and trans, found NaN or infinity in frame {wrong[0]} of {len(trans)}")
     vectors = vectors[:, :66].reshape(-1, 22, 3)
     if rest is None or rest.joint_names != body.joint_names or len(rest.turns) != len(vectors):
-        return _from_smpl(path, body, vectors, trans, betas, float(rates[0]))
-    return rest.put_back(_from_smpl(path, body, vectors, trans, rest.shape, float(rates[0])))
+        return _from_smpl(path, body, vectors, trans, betas, rates[0])
+    return rest.put_back(_from_smpl(path, body, vectors, trans, rest.shape, rates[0]))
 
 
 def _from_smpl(
@@ -170,9 +178,9 @@ class _Rest:
 
     @staticmethod
     def read(arrays: ArrayFile) -> _Rest | None:
-        if arrays.get("capture4d_turns") is None:
+        if "capture4d_turns" not in arrays:
             return None
-        turns, shifts, shape = (arrays[f"capture4d_{name}"] for name in ("turns", "shifts", "shape"))
+        turns, shifts, shape = (arrays.real(f"capture4d_{name}") for name in ("turns", "shifts", "shape"))
         return _Rest(arrays.names("capture4d_joint_names"), turns, shifts, shape)
 
     def arrays(self) -> dict[str, np.ndarray]:

@@ -144,7 +144,9 @@ def retarget(
     duration = (len(world) - 1) * bvh.frame_time_s
     at = np.arange(first_frame / fps, duration + 0.1 / fps, 1 / fps)  # files round their frame time
     if not len(at):
-        raise InputError(f"{bvh.path}: expected a clip longer than {first_frame} frames, found {duration * fps:.0f}")
+        raise InputError(
+            f"expected a clip longer than {first_frame} frames, found {duration * fps:.0f}", where=bvh.path
+        )
     times = np.arange(len(world)) * bvh.frame_time_s
     index = {name: slot for slot, name in enumerate(bvh.joint_names)}
     names, joints, parents = shaped.body.joint_names, shaped.joints, shaped.body.parents
@@ -291,7 +293,7 @@ def _match(bvh: Bvh) -> _Scheme:
     if missing[best]:
         lacking = ", ".join(missing[best][:4])
         raise InputError(
-            f"{bvh.path}: expected joints named as in SMPL or the CMU database, found none called {lacking}"
+            f"expected joints named as in SMPL or the CMU database, found none called {lacking}", where=bvh.path
         )
     return SCHEMES[best]
 

@@ -1,21 +1,19 @@
 """SMPL-family bodies from the user's own licensed files, turned into this project's plain arrays once.
 
 SMPL, SMPL+H and SMPL-X are distributed to registered users as .npz or .pkl. A pickle can run code when it is loaded;
-this reader runs none of it: it accepts the arrays, SciPy sparse matrices and chumpy wrappers those files hold, and
-refuses every other name.
+this reader runs none of it, and builds nothing that the file names (see `capture4d.files.pickled_arrays`).
 """
 
 from __future__ import annotations
 
-import io
-import pickle
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from scipy import sparse
 
 from capture4d.errors import InputError
+from capture4d.files.arrays import ArrayFile
+from capture4d.files.pickled_arrays import read_pickled_arrays
+from capture4d.files.reading import reading
 from capture4d.files.records import save_body
 from capture4d.types import Body, Mesh
 
@@ -52,32 +50,6 @@ SHARED_JOINTS = 22
 MAX_SHAPES = 16
 """The strongest components, which come first."""
 
-_NUMPY_NAMES = {"_reconstruct", "ndarray", "dtype", "scalar"}
-
-
-class _Shell:
-    """Stands in for a chumpy or scipy object: keeps its state, runs nothing."""
-
-    def __init__(self, *_: Any) -> None:
-        self.state: dict[str, Any] = {}
-
-    def __setstate__(self, state: Any) -> None:
-        self.state = state if isinstance(state, dict) else {}
-
-
-class _ArraysOnly(pickle.Unpickler):
-    """An unpickler whose vocabulary is arrays: every global it may build is named here."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        package = module.split(".")[0]
-        if package == "numpy" and name in _NUMPY_NAMES:
-            return super().find_class(module.replace("numpy.core", "numpy._core"), name)
-        if package in ("chumpy", "scipy"):
-            return _Shell
-        if (module, name) == ("_codecs", "encode"):
-            return super().find_class(module, name)
-        raise InputError(f"expected only arrays in the pickle, found {module}.{name}")
-
 
 def convert_smpl(source: Path, output: Path) -> None:
     """Convert an SMPL-family file (.npz or .pkl) to a body file of this project (.npz).
@@ -94,56 +66,24 @@ def read_smpl(source: Path) -> Body:
     Raises:
         InputError: the file is missing, holds anything but arrays, or lacks a part of the model.
     """
-    if not source.is_file():
-        raise InputError(f"{source}: no such body file")
-    try:
-        fields = _read_fields(source)
-    except InputError as error:
-        raise InputError(f"{source}: {error}") from None
-    except Exception as error:  # whatever a damaged file makes of the reader
-        raise InputError(f"{source}: not an SMPL-family file, or damaged ({type(error).__name__})") from None
-    needed = ("v_template", "shapedirs", "J_regressor", "weights", "kintree_table", "f")
-    missing = [name for name in needed if name not in fields]
-    if missing:
-        raise InputError(f"{source}: expected an SMPL-family body, found no {', '.join(missing)}")
-    return _assemble(fields)
+    with reading(source, "body of the SMPL family", absent="no such body file"):
+        return _assemble(_read_fields(source))
 
 
 def _read_fields(source: Path) -> dict[str, np.ndarray]:
-    if source.suffix.lower() == ".npz":
-        with np.load(source, allow_pickle=False) as archive:
-            arrays = {name: _npz_array(archive, name) for name in archive.files}
-        return {name: value for name, value in arrays.items() if value is not None}
-    if source.suffix.lower() != ".pkl":
-        raise InputError(f"expected an .npz or .pkl file, found '{source.suffix}'")
-    loaded = _ArraysOnly(io.BytesIO(source.read_bytes()), encoding="latin1").load()
-    if not isinstance(loaded, dict):
-        raise InputError(f"expected a dictionary of arrays, found {type(loaded).__name__}")
-    arrays = {str(name): _as_array(value) for name, value in loaded.items()}
-    return {name: value for name, value in arrays.items() if value is not None}
-
-
-def _npz_array(archive: Any, name: str) -> np.ndarray | None:
-    """An array of numbers; None for anything else, which is not unpickled."""
-    try:
-        return _as_array(archive[name])
-    except ValueError as error:
-        if "allow_pickle" not in str(error):
-            raise
-        return None
-
-
-def _as_array(value: Any) -> np.ndarray | None:
-    if isinstance(value, np.ndarray):
-        return value if value.dtype.kind in "fiu" else None
-    if isinstance(value, _Shell):
-        state = value.state
-        if "indptr" in state:  # a SciPy compressed sparse matrix
-            shape = state["_shape"] if "_shape" in state else state["shape"]
-            kind = sparse.csr_matrix if len(state["indptr"]) == shape[0] + 1 else sparse.csc_matrix
-            return kind((state["data"], state["indices"], state["indptr"]), shape=shape).toarray()
-        return state.get("x")  # a chumpy array
-    return None
+    match source.suffix.lower():
+        case ".npz":
+            with ArrayFile(source) as arrays:
+                found = arrays.numbers()
+        case ".pkl":
+            found = read_pickled_arrays(source)
+        case other:
+            raise InputError(f"expected an .npz or .pkl file, found '{other}'")
+    needed = ("v_template", "shapedirs", "J_regressor", "weights", "kintree_table", "f")
+    missing = [name for name in needed if name not in found]
+    if missing:
+        raise InputError(f"expected an SMPL-family body, found no {', '.join(missing)}")
+    return found
 
 
 def _assemble(fields: dict[str, np.ndarray]) -> Body:
@@ -158,6 +98,9 @@ def _assemble(fields: dict[str, np.ndarray]) -> Body:
         directions = np.asarray(posedirs, np.float64)
         directions = directions if directions.ndim == 3 else directions.reshape(*template.shape, -1)
         pose_directions = np.moveaxis(directions, 2, 0).astype(np.float32)
+        if len(pose_directions) != 9 * (len(parents) - 1):
+            found = len(pose_directions)
+            raise InputError(f"expected {9 * (len(parents) - 1)} posedirs for {len(parents)} joints, found {found}")
     return Body(
         template=Mesh(template.astype(np.float32), np.asarray(fields["f"]).astype(np.int32)),
         shape_directions=shapes.astype(np.float32),

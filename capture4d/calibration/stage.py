@@ -25,6 +25,7 @@ from capture4d.cameras.colmap import read_model, write_model
 from capture4d.errors import InputError
 from capture4d.files.arrays import ArrayFile
 from capture4d.files.atomic import read_json, write_json, write_npz
+from capture4d.files.reading import reading
 from capture4d.files.records import load_rig, save_rig
 from capture4d.runs.file_stage import open_file_stage
 from capture4d.runs.stage import StageResult
@@ -175,7 +176,7 @@ def run_check(
     found = find_images(images, pattern)
     strangers = sorted({image.camera for image in found} - set(rig.names))
     if strangers:
-        raise InputError(f"{images}: expected cameras of {rig_path}, found {', '.join(strangers)}")
+        raise InputError(f"expected cameras of {rig_path}, found {', '.join(strangers)}", where=images)
     poses = sorted({image.pose for image in found}, key=_natural)
     detections = list(run_jobs(partial(_detect, geometry), found, workers=workers, label="find the board"))
     detections.sort(key=lambda detection: (detection.image.camera, _natural(detection.image.pose)))
@@ -183,7 +184,9 @@ def run_check(
         width, height = (int(size) for size in rig.image_sizes[rig.names.index(detection.image.camera)])
         if detection.size != (width, height):
             seen = "x".join(str(size) for size in detection.size)
-            raise InputError(f"{detection.image.path}: expected {width}x{height} pixels as in the rig, found {seen}")
+            raise InputError(
+                f"expected {width}x{height} pixels as in the rig, found {seen}", where=detection.image.path
+            )
     covariance = read_covariance(rig_path, cameras=len(rig.names))
     return check_rig(rig, _views(detections, rig.names, poses), geometry, covariance=covariance, config=config)
 
@@ -211,13 +214,13 @@ def find_images(folder: Path, pattern: str = PATTERN) -> list[BoardImage]:
     if sorted(re.findall(r"{(.*?)}", pattern)) != ["camera", "pose"]:
         raise InputError(f"--pattern: expected {{camera}} and {{pose}} once each, found '{pattern}'")
     if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder")
+        raise InputError("no such folder", where=folder)
     expression = re.escape(pattern.strip("/"))
     for name in ("camera", "pose"):
         expression = expression.replace(re.escape(f"{{{name}}}"), f"(?P<{name}>[^/]+?)")
     paths = [path for path in sorted(folder.rglob("*")) if path.suffix.lower() in ENDINGS and path.is_file()]
     if not paths:
-        raise InputError(f"{folder}: expected images ({', '.join(ENDINGS)}), found none")
+        raise InputError(f"expected images ({', '.join(ENDINGS)}), found none", where=folder)
     found: dict[tuple[str, str], BoardImage] = {}
     for path in paths:
         match = re.fullmatch(expression, path.relative_to(folder).with_suffix("").as_posix())
@@ -226,9 +229,9 @@ def find_images(folder: Path, pattern: str = PATTERN) -> list[BoardImage]:
         image = BoardImage(match["camera"], match["pose"], path)
         twin = found.setdefault((image.camera, image.pose), image)
         if twin is not image:
-            raise InputError(f"{path}: expected one image of a camera and a pose, found {twin.path} as well")
+            raise InputError(f"expected one image of a camera and a pose, found {twin.path} as well", where=path)
     if not found:
-        raise InputError(f"{paths[0]}: expected images that lie as --pattern '{pattern}' says, found none")
+        raise InputError(f"expected images that lie as --pattern '{pattern}' says, found none", where=paths[0])
     return sorted(found.values(), key=lambda image: (_natural(image.camera), _natural(image.pose)))
 
 
@@ -236,14 +239,11 @@ def find_images(folder: Path, pattern: str = PATTERN) -> list[BoardImage]:
 
 
 def _detect(board: Board, image: BoardImage) -> _Detection:
-    try:
-        picture = cv2.imdecode(
-            np.frombuffer(image.path.read_bytes(), np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-        )
-    except cv2.error:
-        picture = None
-    if picture is None:
-        raise InputError(f"{image.path}: not a readable image, cut off or damaged")
+    with reading(image.path, "image"):
+        data = np.frombuffer(image.path.read_bytes(), np.uint8)
+        picture = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+        if picture is None:
+            raise InputError("not a readable image, cut off or damaged")
     ids, pixels = detect_corners(picture, board)
     return _Detection(image, (picture.shape[1], picture.shape[0]), ids, pixels)
 
@@ -316,7 +316,7 @@ def _image_sizes(detections: Sequence[_Detection], names: Sequence[str]) -> np.n
         if detection.size != usual.size:
             expected, seen = ("x".join(str(size) for size in entry.size) for entry in (usual, detection))
             raise InputError(
-                f"{detection.image.path}: expected {expected} pixels as in {usual.image.path.name}, found {seen}"
+                f"expected {expected} pixels as in {usual.image.path.name}, found {seen}", where=detection.image.path
             )
     return np.array([first[name].size for name in names], np.int32)
 

@@ -8,20 +8,29 @@ z forward; a COLMAP pose (`cam_from_world`) is our T_camera_world.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
+from capture4d.cameras.colmap_files import (
+    ColmapCamera,
+    ColmapImage,
+    model_suffix,
+    read_cameras,
+    read_frames,
+    read_images,
+)
 from capture4d.errors import InputError
+from capture4d.files.reading import reading
 from capture4d.heavy_imports import import_pycolmap
 from capture4d.types import Rig
 
 __all__ = ["colmap_camera", "lens_of", "read_model", "sensor", "to_colmap_pixels", "write_model"]
 
 HALF_PIXEL = 0.5
-PARTS = ("cameras", "images", "rigs", "frames", "points3D")
 # Where the parameters of a COLMAP camera model lie in fx fy cx cy k1 k2 p1 p2 k3.
 _PARAMETERS = {
     "SIMPLE_PINHOLE": (0, 0, 1, 2),
@@ -69,11 +78,16 @@ def lens_of(camera: Any) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray
     Raises:
         InputError: its model is not a special case of OpenCV's five coefficients.
     """
-    model, given = camera.model.name, np.asarray(camera.params, np.float64)
+    size = camera.width, camera.height
+    return _lens(camera.camera_id, ColmapCamera(camera.model.name, *size, np.asarray(camera.params, np.float64)))
+
+
+def _lens(camera_id: int, camera: ColmapCamera) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, " 5"]]:
+    model, given = camera.model, camera.parameters
     places = _PARAMETERS.get(model)
     if places is None or np.any(given[9:] != 0):
         wanted = ", ".join(_PARAMETERS)
-        raise InputError(f"camera {camera.camera_id}: expected one of {wanted} without k4 to k6, found {model}")
+        raise InputError(f"camera {camera_id}: expected one of {wanted} without k4 to k6, found {model}")
     values = np.zeros(9)
     values[: len(places)] = given[list(places)]
     values[2:4] -= HALF_PIXEL
@@ -129,34 +143,35 @@ def read_model(folder: str | Path) -> Rig:
         InputError: not a model, no image in it, or a camera that OpenCV's five coefficients cannot describe.
     """
     folder = Path(folder)
-    suffixes = [s for s in (".bin", ".txt") if all((folder / f"{part}{s}").is_file() for part in PARTS[:2])]
-    if not suffixes:
-        raise InputError(f"{folder}: expected a COLMAP model (cameras and images, .bin or .txt), found none")
-    try:
-        model = import_pycolmap().Reconstruction(folder)
-    except (RuntimeError, ValueError, IndexError) as error:
-        raise InputError(f"{folder}: not a readable COLMAP model ({' '.join(str(error).split())})") from None
-    frames = [model.frames[frame_id] for frame_id in sorted(model.reg_frame_ids())]
-    if not frames:
-        raise InputError(f"{folder}: expected a model with images that have poses, found none")
-    widest = max(frames, key=lambda frame: len(list(frame.image_ids)))
-    moving = len(list(widest.image_ids)) > 1
-    chosen = [widest] if moving else frames
-    images = [model.images[data.id] for frame in chosen for data in sorted(frame.image_ids, key=lambda d: d.id)]
-    try:
-        lenses = [lens_of(model.cameras[image.camera_id]) for image in images]
-    except InputError as error:
-        raise InputError(f"{folder}: {error}") from None
-    cameras = [model.cameras[image.camera_id] for image in images]
-    transforms = np.tile(np.eye(4), (len(images), 1, 1))
-    transforms[:, :3] = [image.cam_from_world().matrix() for image in images]
+    suffix = model_suffix(folder)
+    cameras = read_cameras(folder / f"cameras{suffix}")
+    images = read_images(folder / f"images{suffix}")
+    if not images:
+        raise InputError("expected a model with images that have poses, found none", where=folder)
+    frames = _frames_of(images, read_frames(folder / f"frames{suffix}"))
+    widest = max(frames, key=len)
+    moving = len(widest) > 1
+    chosen = [images[image_id] for frame in ([widest] if moving else frames) for image_id in frame]
+    missing = [image.camera_id for image in chosen if image.camera_id not in cameras]
+    if missing:
+        raise InputError(f"expected camera {missing[0]} of an image, found none of this number", where=folder)
+    with reading(folder, "COLMAP model"):
+        lenses = [_lens(image.camera_id, cameras[image.camera_id]) for image in chosen]
+    sizes = [(cameras[image.camera_id].width, cameras[image.camera_id].height) for image in chosen]
     return Rig(
-        names=_camera_names([image.name for image in images], by_folder=moving and len(frames) > 1),
+        names=_camera_names([image.name for image in chosen], by_folder=moving and len(frames) > 1),
         intrinsics=np.stack([intrinsics for intrinsics, _ in lenses]),
         distortion=np.stack([distortion for _, distortion in lenses]),
-        T_camera_world=transforms,
-        image_sizes=np.array([[camera.width, camera.height] for camera in cameras], np.int32),
+        T_camera_world=np.stack([image.T_camera_world for image in chosen]),
+        image_sizes=np.array(sizes, np.int32),
     )
+
+
+def _frames_of(images: Mapping[int, ColmapImage], frames: Mapping[int, tuple[int, ...]]) -> list[list[int]]:
+    """The numbers of the images that were taken at once; an image of no frame is alone."""
+    grouped = [sorted(image_id for image_id in frames[number] if image_id in images) for number in sorted(frames)]
+    known = {image_id for frame in grouped for image_id in frame}
+    return [frame for frame in grouped if frame] + [[image_id] for image_id in sorted(images) if image_id not in known]
 
 
 def _camera_names(images: list[str], *, by_folder: bool) -> tuple[str, ...]:

@@ -27,6 +27,7 @@ from capture4d.colours.spaces import Colour, format_colour, parse_colour
 from capture4d.errors import InputError
 from capture4d.files.atomic import content_digest, file_digest, parse_json, write_json
 from capture4d.files.meshes import MESH_SUFFIXES, read_coloured_mesh, read_mesh, write_mesh
+from capture4d.files.reading import one_line, shortened
 from capture4d.files.records import (
     load_body,
     load_garment,
@@ -232,11 +233,11 @@ def read_capture(path: str | Path, *, scans: bool = True) -> Capture:
             files=files,
         )
     except InputError as error:
-        raise error.at(description) from None
+        raise InputError(shortened(error.reason), where=description) from None
     except KeyError as error:
         raise InputError(f"expected the entry {error}, found none", where=description) from None
-    except (AttributeError, TypeError, ValueError) as error:
-        raise InputError(str(error), where=description) from None
+    except (AttributeError, OverflowError, TypeError, ValueError) as error:
+        raise InputError(one_line(error), where=description) from None
     missing = [frame_id for frame_id in capture.frame_ids if frame_id not in files.scans]
     if scans and missing:
         raise InputError(

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 
 import numpy as np
 
 from capture4d.errors import InputError
+from capture4d.files.arrays import ArrayFile
 from capture4d.files.atomic import write_npz
 from capture4d.types import GarmentScan, Mesh
 
@@ -32,20 +32,14 @@ def load_garment_scan(path: Path, frame_id: int) -> GarmentScan:
     Raises:
         InputError: the file is missing or damaged, or holds the reason why the frame has no garment.
     """
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            if "reason" in arrays:
-                raise InputError(str(arrays["reason"]))
+    with ArrayFile(path, kind="garment scan") as arrays:
+        if "reason" not in arrays:
             return GarmentScan(
                 mesh=Mesh(arrays["vertices"], arrays["faces"]),
                 boundary_points=arrays["boundary_points"],
                 boundary_loops=arrays["boundary_loops"],
-                loop_names=tuple(str(name) for name in arrays["loop_names"]),
+                loop_names=arrays.names("loop_names"),
                 frame_id=frame_id,
             )
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except (ValueError, KeyError, EOFError, OSError, zipfile.BadZipFile) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{path}: not a readable garment scan, cut off or damaged ({error})") from None
+        reason = str(arrays["reason"])
+    raise InputError(reason)  # of the scan, which it names

@@ -16,8 +16,13 @@ import numpy as np
 
 from capture4d.captures.capture import Capture, read_capture
 from capture4d.errors import InputError, StaleError
-from capture4d.files.arrays import ArrayFile
-from capture4d.files.atomic import read_json, read_json_lines, write_npy_rows
+from capture4d.files.arrays import ArrayFile, map_array
+from capture4d.files.atomic import (
+    read_json,
+    read_json_lines,
+    write_npy_rows,
+)
+from capture4d.files.reading import reading
 from capture4d.files.records import load_body, load_garment, load_poses
 from capture4d.runs.stage import Stage, require_complete
 from capture4d.types import Body, PoseSequence, RegisteredSequence
@@ -182,15 +187,11 @@ def load_registration(folder: Path) -> RegisteredSequence:
         with ArrayFile(folder / "frames" / f"{frame_id:06d}.npz") as arrays:
             residual.append(arrays["residual_m"])
     path = folder / "vertices.npy"
-    try:
-        vertices = np.load(path, mmap_mode="r", allow_pickle=False)
-    except FileNotFoundError:
-        raise InputError(f"no such file; run the command of '{folder.name}' again", where=path) from None
-    except (ValueError, EOFError) as error:
-        raise InputError(f"expected the vertices of all frames, found a damaged file ({error})", where=path) from None
+    vertices = map_array(path, absent=f"no such file; run the command of '{folder.name}' again")
     if len(vertices) != len(frame_ids):
         raise InputError(f"expected vertices of {len(frame_ids)} frames, found {len(vertices)}", where=path)
-    return RegisteredSequence(garment, vertices, np.array(residual, np.float32), np.array(frame_ids, np.int32))
+    with reading(path, "npy file"):
+        return RegisteredSequence(garment, vertices, np.array(residual, np.float32), np.array(frame_ids, np.int32))
 
 
 def stack_vertices(stage: Stage, frame_ids: Sequence[int]) -> None:
@@ -198,7 +199,7 @@ def stack_vertices(stage: Stage, frame_ids: Sequence[int]) -> None:
 
     def frames() -> Iterator[np.ndarray]:
         for frame_id in frame_ids:
-            with np.load(stage.frame_path(frame_id), allow_pickle=False) as arrays:
+            with ArrayFile(stage.frame_path(frame_id)) as arrays:
                 yield arrays["vertices"]
 
     write_npy_rows(stage.path / "vertices.npy", frames(), count=len(frame_ids))

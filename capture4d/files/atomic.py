@@ -16,11 +16,13 @@ from typing import Any
 import numpy as np
 
 from capture4d.errors import InputError
+from capture4d.files.reading import reading
 
 __all__ = [
     "TEMPORARY_SUFFIX",
     "content_digest",
     "file_digest",
+    "nan_to_none",
     "parse_json",
     "plain_value",
     "read_json",
@@ -28,6 +30,7 @@ __all__ = [
     "write_bytes",
     "write_chunks",
     "write_json",
+    "write_json_lines",
     "write_npy",
     "write_npy_rows",
     "write_npz",
@@ -82,6 +85,18 @@ def write_json(path: str | Path, value: Any) -> None:
     write_bytes(path, (json.dumps(value, indent=2, allow_nan=False, default=plain_value) + "\n").encode())
 
 
+def write_json_lines(path: str | Path, rows: Iterable[Mapping[str, Any]], *, sort_keys: bool = False) -> None:
+    """Write a JSON object a line, atomically. NaN is not JSON and raises ValueError; see `nan_to_none`."""
+    lines = (json.dumps(row, sort_keys=sort_keys, allow_nan=False, default=plain_value) + "\n" for row in rows)
+    write_bytes(path, "".join(lines).encode())
+
+
+def nan_to_none(row: Mapping[str, Any]) -> dict[str, Any]:
+    """A row as JSON can hold it: null where there is no finite number."""
+    missing = {key for key, value in row.items() if isinstance(value, (float, np.floating)) and not np.isfinite(value)}
+    return {key: None if key in missing else value for key, value in row.items()}
+
+
 def write_npy(path: str | Path, array: np.ndarray) -> None:
     """Write one array, atomically."""
     buffer = io.BytesIO()
@@ -113,42 +128,40 @@ def write_npz(path: str | Path, **arrays: Any) -> None:
     write_bytes(path, buffer.getvalue())
 
 
-def read_json(path: str | Path) -> Any:
-    """Read JSON; a missing or damaged file is an InputError that names it."""
+def read_json(path: str | Path) -> dict[str, Any]:
+    """Read a JSON object; whatever is wrong with the file is an InputError that names it."""
     path = Path(path)
-    try:
+    with reading(path, "JSON file"):
         return parse_json(path.read_bytes(), path)
-    except FileNotFoundError:
-        raise InputError("no such file", where=path) from None
 
 
-def parse_json(data: bytes, path: Path) -> Any:
-    """The value in a file's bytes; damage is an InputError that names the file."""
-    try:
-        return json.loads(data.decode())
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"not valid JSON ({error})", where=path) from None
+def parse_json(data: bytes, path: Path) -> dict[str, Any]:
+    """The object in a file's bytes; damage is an InputError that names the file."""
+    with reading(path, "JSON file"):
+        return _json_object(data)
 
 
 def read_json_lines(path: str | Path) -> list[dict[str, Any]]:
-    """Read a file with a JSON object a line; a missing or damaged file is an InputError that names it and the line."""
+    """Read a file with a JSON object a line; whatever is wrong with it is an InputError that names it and the line."""
     path = Path(path)
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not valid JSON ({error})") from None
     rows = []
-    for number, line in enumerate(lines, start=1):
-        try:
-            row = json.loads(line)
-        except json.JSONDecodeError as error:
-            raise InputError(f"{path}: line {number}: not valid JSON ({error})") from None
-        if not isinstance(row, dict):
-            raise InputError(f"{path}: line {number}: expected a JSON object, found {type(row).__name__}")
-        rows.append(row)
+    with reading(path, "JSON file"):
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+            try:
+                rows.append(_json_object(line))
+            except InputError as error:
+                raise InputError(f"line {number}: {error.reason}") from None
     return rows
+
+
+def _json_object(text: str | bytes) -> dict[str, Any]:
+    try:
+        found = json.loads(text if isinstance(text, str) else text.decode())
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"not valid JSON ({error})") from None
+    if not isinstance(found, dict):
+        raise InputError(f"expected a JSON object, found {type(found).__name__}")
+    return found
 
 
 def file_digest(paths: Iterable[Path], *, root: Path) -> str:

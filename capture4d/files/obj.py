@@ -16,12 +16,15 @@ from capture4d.types import Mesh
 
 __all__ = ["obj_bytes", "read_obj"]
 
+_MOST = 2**31 - 1
+"""What our own indices can count."""
+
 
 def read_obj(path: Path) -> MeshFile:
     """Read an OBJ file; `capture4d.files.meshes.read_mesh` is the way in.
 
     Raises:
-        InputError: names the file and the line.
+        InputError: names the line; the file is named there.
     """
     vertices: list[list[float]] = []
     texture: list[list[float]] = []
@@ -51,7 +54,7 @@ def read_obj(path: Path) -> MeshFile:
                         corners.append(_index(vertex, len(vertices)))
                         corner_texture.append(_index(uv, len(texture)) if uv else -1)
             except InputError as error:
-                raise type(error)(f"{path}:{number}: {error}") from None
+                raise type(error)(error.reason, line=number) from None
 
     size_of = np.array(sizes, np.int64)
     corner_of = np.array(corners, np.int64)
@@ -63,7 +66,7 @@ def read_obj(path: Path) -> MeshFile:
         beyond = np.flatnonzero(indices >= count)
         if len(beyond):
             line = face_lines[int(np.searchsorted(np.cumsum(size_of), beyond[0], side="right"))]
-            raise InputError(f"{path}:{line}: {name} {indices[beyond[0]] + 1} does not exist, the file has {count}")
+            raise InputError(f"{name} {indices[beyond[0]] + 1} does not exist, the file has {count}", line=line)
 
     coloured = bool(vertices) and all(len(vertex) == 6 for vertex in vertices)
     table = np.array([vertex if coloured else vertex[:3] for vertex in vertices], np.float64)
@@ -78,11 +81,11 @@ def _numbers(fields: list[str], *, at_least: int) -> list[float]:
     try:
         numbers = [float(field) for field in fields]
     except ValueError:
-        raise InputError(f"expected numbers, found '{' '.join(fields)}'") from None
+        raise InputError(f"expected numbers, found '{' '.join(fields)[:80]}'") from None
     if len(numbers) < at_least:
         raise InputError(f"expected at least {at_least} numbers, found {len(numbers)}")
     if not np.isfinite(numbers).all():
-        raise NotFiniteError(f"expected finite numbers, found '{' '.join(fields)}'")
+        raise NotFiniteError(f"expected finite numbers, found '{' '.join(fields)[:80]}'")
     return numbers
 
 
@@ -91,7 +94,9 @@ def _index(text: str, count: int) -> int:
     try:
         index = int(text)
     except ValueError:
-        raise InputError(f"expected an index, found '{text}'") from None
+        raise InputError(f"expected an index, found '{text[:80]}'") from None
+    if abs(index) > _MOST:
+        raise InputError(f"expected an index of at most {_MOST}, found '{text[:80]}'")
     if index == 0 or index < -count:
         raise InputError(f"expected an index from 1, or from -1 down to -{count}, found {index}")
     return index - 1 if index > 0 else count + index

@@ -40,6 +40,9 @@ _TYPES = {
 }
 
 
+_INDICES = ("vertex_indices", "vertex_index")
+
+
 @dataclass(slots=True)
 class _Element:
     """One kind of record in a PLY file, and its columns once they are read."""
@@ -56,12 +59,11 @@ class _Element:
             raise ValueError(self.count)
 
     def add(self, name: str, kind: str, length: str) -> None:
-        if any(name == other for other, _, _ in self.properties):
+        if any(name == other for other, _, _ in self.properties) or length.startswith("f"):
             raise ValueError(name)
         self.properties.append((name, kind, length))
 
 
-@np.errstate(invalid="ignore")  # NaN and its kin are found, and named, once they are vertices or indices
 def read_ply(path: Path) -> MeshFile:
     """Read a PLY file; `capture4d.files.meshes.read_mesh` is the way in.
 
@@ -76,8 +78,8 @@ def read_ply(path: Path) -> MeshFile:
     else:
         _records_ascii(elements, body)
 
-    columns = {element.name: element.columns for element in elements}
-    vertex, face = columns.get("vertex", {}), columns.get("face", {})
+    vertex, _ = _columns(elements, "vertex")
+    face_values, face = _columns(elements, "face")
     if not {"x", "y", "z"} <= vertex.keys():
         raise InputError(f"expected vertices with x, y and z, found {', '.join(vertex) or 'none'}")
     vertices = np.column_stack([vertex[axis] for axis in "xyz"]).astype(np.float64)
@@ -85,7 +87,10 @@ def read_ply(path: Path) -> MeshFile:
     if {"red", "green", "blue"} <= vertex.keys():
         colours = colour_bytes(np.column_stack([vertex[channel] for channel in ("red", "green", "blue")]))
 
-    lists = next((face[name] for name in ("vertex_indices", "vertex_index") if name in face), [])
+    for name in _INDICES:
+        if name in face_values:
+            raise InputError(f"expected a list of corners in every face, found one number called {name}")
+    lists = next((face[name] for name in _INDICES if name in face), [])
     sizes = np.array([len(row) for row in lists], np.int64)
     corners = _joined(lists, np.int64)
     corner_uv = None
@@ -97,6 +102,21 @@ def read_ply(path: Path) -> MeshFile:
             corner_uv = np.column_stack([vertex[u], vertex[v]])[np.clip(corners, 0, len(vertices) - 1)]
     mesh, polygon_sizes = polygon_mesh(vertices, corners, sizes, corner_uv)
     return MeshFile(mesh, colours, polygon_sizes)
+
+
+def _columns(elements: list[_Element], name: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Of one element: its properties that are a value, and those that are a list."""
+    for element in elements:
+        if element.name == name:
+            lists = {each for each, _, length in element.properties if length}
+            kinds = {each: kind for each, kind, _ in element.properties}
+            for index in _INDICES:
+                if kinds.get(index, "i").startswith("f"):
+                    raise InputError(f"expected whole numbers as {index}, found a list of floats")
+            columns = element.columns
+            values = {each: columns[each] for each in columns if each not in lists}
+            return values, {each: columns[each] for each in columns if each in lists}
+    return {}, {}
 
 
 def _header(head: bytes) -> tuple[list[_Element], str]:
@@ -112,13 +132,15 @@ def _header(head: bytes) -> tuple[list[_Element], str]:
                 case ["format", name, _]:
                     order = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}[name]
                 case ["element", name, count]:
+                    if any(name == element.name for element in elements):
+                        raise ValueError(name)
                     elements.append(_Element(name, int(count), [], {}))
                 case ["property", "list", length, kind, name]:
                     elements[-1].add(name, _TYPES[kind], _TYPES[length])
                 case ["property", kind, name]:
                     elements[-1].add(name, _TYPES[kind], "")
         except (KeyError, ValueError, IndexError):
-            raise InputError(f"damaged header, cannot read '{line.strip()}'") from None
+            raise InputError(f"damaged header, cannot read '{line.strip()[:80]}'") from None
     if order is None or not elements:
         raise InputError("cut off in the header")
     return elements, order
@@ -127,6 +149,8 @@ def _header(head: bytes) -> tuple[list[_Element], str]:
 def _records_binary(elements: list[_Element], body: bytes, order: str) -> None:
     offset = 0
     for element in elements:
+        if not element.properties:  # whatever their number, nothing is there
+            continue
         offset = _equal_records(element, body, offset, order) or _single_records(element, body, offset, order)
 
 
@@ -141,7 +165,7 @@ def _equal_records(element: _Element, body: bytes, offset: int, order: str) -> i
             if size + step > len(body):
                 return None
             entries = int(np.frombuffer(body, order + length, 1, size)[0])
-            if entries < 0:
+            if entries < 0 or entries > len(body):
                 return None
             fields.append((f"{name} length", order + length))
             size += step
@@ -190,14 +214,16 @@ def _records_ascii(elements: list[_Element], body: bytes) -> None:
         raise InputError(f"damaged, {error}") from None
     offset = 0
     for element in elements:
+        if not element.properties:
+            continue
         if not any(length for _, _, length in element.properties):
             table = numbers[offset : offset + element.count * len(element.properties)]
             if len(table) < element.count * len(element.properties):
                 raise _cut_off(element, len(table) // len(element.properties))
             offset += len(table)
-            table = table.reshape(element.count, -1)
+            table = table.reshape(element.count, len(element.properties))
             element.columns = {
-                name: table[:, index].astype(kind) for index, (name, kind, _) in enumerate(element.properties)
+                name: _typed(table[:, index], kind, name) for index, (name, kind, _) in enumerate(element.properties)
             }
             continue
         rows: dict[str, list[np.ndarray]] = {name: [] for name, _, _ in element.properties}
@@ -209,9 +235,18 @@ def _records_ascii(elements: list[_Element], body: bytes) -> None:
                     offset += 1
                 if entries < 0 or offset + entries > len(numbers):
                     raise _cut_off(element, row)
-                rows[name].append(numbers[offset : offset + entries].astype(kind))
+                rows[name].append(_typed(numbers[offset : offset + entries], kind, name))
                 offset += entries
         _keep(element, rows)
+
+
+def _typed(numbers: np.ndarray, kind: str, name: str) -> np.ndarray:
+    """Numbers of a text file as the type that its header gives them."""
+    typed = numbers.astype(kind)
+    if not kind.startswith("f") and (typed != numbers).any():
+        wrong = numbers[typed != numbers][0]
+        raise InputError(f"expected {name} from {np.iinfo(kind).min} to {np.iinfo(kind).max}, found {wrong:g}")
+    return typed
 
 
 def _keep(element: _Element, rows: dict[str, list[np.ndarray]]) -> None:

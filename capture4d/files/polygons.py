@@ -62,5 +62,6 @@ def colour_bytes(values: np.ndarray) -> UInt8[np.ndarray, "verts 3"]:
     """Files hold colours as bytes, or as fractions of one."""
     if values.dtype == np.uint8:
         return values
+    values = np.nan_to_num(values, nan=0, posinf=255, neginf=0)
     scale = 255 if values.size and values.max() <= 1 else 1
     return np.clip(np.rint(values * scale), 0, 255).astype(np.uint8)

@@ -9,6 +9,7 @@ import numpy as np
 from capture4d.errors import InputError
 from capture4d.files.arrays import ArrayFile, mesh_arrays
 from capture4d.files.atomic import read_json, write_json, write_npz
+from capture4d.files.reading import reading
 from capture4d.types import Body, Garment, PoseSequence, Rig
 
 __all__ = ["load_body", "load_garment", "load_poses", "load_rig", "save_body", "save_garment", "save_poses", "save_rig"]
@@ -63,7 +64,7 @@ def load_poses(path: str | Path) -> PoseSequence:
             translations=arrays["translations"],
             shape=arrays["shape"],
             frame_ids=arrays["frame_ids"],
-            fps=float(arrays["fps"]),
+            fps=arrays.number("fps"),
             joint_names=arrays.names("joint_names"),
         )
 
@@ -113,21 +114,19 @@ def save_rig(path: str | Path, rig: Rig) -> None:
 
 def load_rig(path: str | Path) -> Rig:
     found = read_json(path)
-    if not isinstance(found, dict):
-        raise InputError(f"{path}: expected a JSON object with cameras, found {type(found).__name__}")
-    try:
+    with reading(path, "rig"):
+        if "cameras" not in found:
+            raise InputError("expected the entry 'cameras', found none")
         cameras = found["cameras"]
         if not cameras:
             raise InputError("expected at least one camera, found none")
-        return Rig(
-            names=tuple(str(camera["name"]) for camera in cameras),
-            intrinsics=np.array([camera["intrinsics"] for camera in cameras], np.float64),
-            distortion=np.array([camera["distortion"] for camera in cameras], np.float64),
-            T_camera_world=np.array([camera["T_camera_world"] for camera in cameras], np.float64),
-            image_sizes=np.array([[camera["width"], camera["height"]] for camera in cameras], np.int32),
-        )
-    except KeyError as error:
-        where = "" if str(error) == "'cameras'" else " for every camera"
-        raise InputError(f"{path}: expected the entry {error}{where}, found none") from None
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{path}: {error}") from None
+        try:
+            return Rig(
+                names=tuple(str(camera["name"]) for camera in cameras),
+                intrinsics=np.array([camera["intrinsics"] for camera in cameras], np.float64),
+                distortion=np.array([camera["distortion"] for camera in cameras], np.float64),
+                T_camera_world=np.array([camera["T_camera_world"] for camera in cameras], np.float64),
+                image_sizes=np.array([[camera["width"], camera["height"]] for camera in cameras], np.int32),
+            )
+        except KeyError as error:
+            raise InputError(f"expected the entry {error} for every camera, found none") from None

@@ -14,6 +14,7 @@ import safetensors.numpy
 
 from capture4d.errors import InputError
 from capture4d.files.atomic import write_bytes
+from capture4d.files.reading import reading
 
 __all__ = ["TensorFile", "read_tensors", "write_tensors"]
 
@@ -32,7 +33,7 @@ class TensorFile:
 
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self.tensors:
-            raise InputError(f"{self.path}: expected a tensor '{name}', found {', '.join(self.tensors) or 'none'}")
+            raise InputError(f"expected a tensor '{name}', found {', '.join(self.tensors) or 'none'}", where=self.path)
         return self.tensors[name]
 
     def get(self, name: str) -> np.ndarray | None:
@@ -45,7 +46,7 @@ class TensorFile:
     def entry(self, name: str) -> Any:
         """An entry of the note."""
         if name not in self.note:
-            raise InputError(f"{self.path}: expected '{name}' in its note, found {', '.join(self.note) or 'none'}")
+            raise InputError(f"expected '{name}' in its note, found {', '.join(self.note) or 'none'}", where=self.path)
         return self.note[name]
 
 
@@ -68,19 +69,19 @@ def read_tensors(path: str | Path, kind: str) -> TensorFile:
         InputError: it is missing, cut off, a pickle or another kind of file.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
-    try:
-        with safetensors.safe_open(path, framework="numpy") as file:
-            note = json.loads((file.metadata() or {}).get(_NOTE, "{}"))
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
-    except (safetensors.SafetensorError, json.JSONDecodeError) as error:
+    with reading(path, "safetensors file"):
         with path.open("rb") as stream:
             start = stream.read(4)
-        if start.startswith(_PICKLE_STARTS):  # a header of 128 bytes begins like a pickle, but it can be read
-            message = "expected a safetensors file, found a pickle or an archive, which is not opened"
-            raise InputError(f"{path}: {message}") from None
-        raise InputError(f"{path}: not a readable safetensors file, cut off or damaged ({error})") from None
-    if note.get("kind") != kind:
-        raise InputError(f"{path}: expected {kind}, found {note.get('kind') or 'a file of somebody else'}")
+        try:
+            with safetensors.safe_open(path, framework="numpy") as file:
+                note = json.loads((file.metadata() or {}).get(_NOTE, "{}"))
+                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+        except Exception as error:  # whatever the reader meets
+            if start.startswith(_PICKLE_STARTS):  # a header of 128 bytes begins like a pickle, but it can be read
+                raise InputError("expected a safetensors file, found a pickle or an archive, which is not opened"
+                                 ) from None  # fmt: skip
+            raise error
+        if not isinstance(note, dict) or note.get("kind") != kind:
+            found = note.get("kind") if isinstance(note, dict) else None
+            raise InputError(f"expected {kind}, found {found or 'a file of somebody else'}")
     return TensorFile(path, tensors, note)

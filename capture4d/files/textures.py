@@ -1,4 +1,4 @@
-"""Colours of a textured scan at its vertices.
+"""Textures: the image that a mesh file names, and its colours at the vertices.
 
 The image is read at every face corner, between pixels, and a vertex takes the mean of its corners: across a seam both
 sides show the same paint.
@@ -6,13 +6,67 @@ sides show the same paint.
 
 from __future__ import annotations
 
+import io
+import re
+import warnings
+from pathlib import Path
+
 import numpy as np
 from jaxtyping import UInt8
 
 from capture4d.errors import InputError
+from capture4d.files.reading import companion, one_line, reading
 from capture4d.types import Mesh
 
-__all__ = ["texture_colours"]
+__all__ = ["named_texture", "read_texture", "texture_colours", "texture_pixels"]
+
+_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "TGA")
+"""What is opened, whatever the file is called: Pillow knows others that start programs."""
+_HEAD = 65_536
+
+
+def named_texture(path: Path) -> Path | None:
+    """The one image that the head of an obj (by its mtl) or of a ply names.
+
+    Raises:
+        InputError: it names several, one that is not there, or one that does not lie beside it or in a folder below.
+    """
+    with path.open("rb") as file:
+        head = file.read(_HEAD).decode("utf-8", errors="replace")
+    if path.suffix.lower() == ".ply":
+        names = re.findall(r"^comment TextureFile (.+?)\s*$", head.partition("end_header")[0], re.M)
+    else:
+        names = []
+        for library in re.findall(r"^mtllib (.+?)\s*$", head, re.M):
+            lines = companion(path, library, "materials").read_text(encoding="utf-8", errors="replace")
+            names += re.findall(r"^\s*map_Kd (?:-\S+ \S+ )*(.+?)\s*$", lines, re.M)
+    if len(set(names)) > 1:
+        raise InputError(f"expected one texture, found {', '.join(sorted(set(names)))}", where=path)
+    return companion(path, names[0], "texture") if names else None
+
+
+def read_texture(picture: Path) -> UInt8[np.ndarray, "rows columns 3"]:
+    """The pixels of an image file, sRGB."""
+    with reading(picture, "image"):
+        return texture_pixels(picture.read_bytes())
+
+
+def texture_pixels(data: bytes) -> UInt8[np.ndarray, "rows columns 3"]:
+    """The pixels of an image, sRGB.
+
+    Raises:
+        InputError: it is damaged, too large, or not an image; the message names no file.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of large images: it stops at twice that by itself; of odd metadata
+            with Image.open(io.BytesIO(data), formats=_FORMATS) as image:
+                return np.array(image.convert("RGB"))
+    except Exception as error:  # whatever Pillow's readers meet in a damaged file
+        says = "none of " + ", ".join(_FORMATS) if isinstance(error, UnidentifiedImageError) else one_line(error)
+        raise InputError(f"not a readable image, damaged or too large ({says})") from error
 
 
 def texture_colours(mesh: Mesh, image: UInt8[np.ndarray, "rows columns 3"]) -> UInt8[np.ndarray, "verts 3"]:

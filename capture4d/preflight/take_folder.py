@@ -76,16 +76,16 @@ def open_take(path: Path, claims: Claims | None = None) -> TakeFolder:
     """
     claims = claims or Claims()
     if not path.is_dir():
-        raise InputError(f"{path}: expected a capture folder or a folder of scans, found {_kind(path)}")
+        raise InputError(f"expected a capture folder or a folder of scans, found {_kind(path)}", where=path)
     described = path / "capture.json"
     description = read_json(described) if described.is_file() else {}
     if not isinstance(description, dict):
-        raise InputError(f"{described}: expected a JSON object, found {type(description).__name__}")
+        raise InputError(f"expected a JSON object, found {type(description).__name__}", where=described)
     folder = path / "scans" if (path / "scans").is_dir() else path
     found = _numbered_files(folder, claims.frames)
     if not found:
         wanted = claims.frames or f"files with a frame number ({', '.join(MESH_SUFFIXES)})"
-        raise InputError(f"{folder}: expected scans named {wanted}, found none")
+        raise InputError(f"expected scans named {wanted}, found none", where=folder)
     files = {number: names[0] for number, names in sorted(found.items())}
     poses_path, body_path = (
         given or (path / name if (path / name).is_file() else None)
@@ -97,9 +97,9 @@ def open_take(path: Path, claims: Claims | None = None) -> TakeFolder:
     try:
         facts = _facts(description, claims, tuple(files), poses)
     except InputError as error:
-        raise InputError(f"{described}: {error}") from None
+        raise error.at(described) from None
     except (AttributeError, TypeError, ValueError) as error:
-        raise InputError(f"{described}: {error}") from None
+        raise InputError(f"{error}", where=described) from None
     also = {number: tuple(names[1:]) for number, names in sorted(found.items()) if len(names) > 1}
     facts = replace(facts, duplicated=tuple(also))
     moving = poses is not None and (body_path is not None or poses.joint_names == load_anny().joint_names)

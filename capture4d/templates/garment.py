@@ -65,17 +65,20 @@ def make_template(
     _require_surface(mesh, source)
     size = float(np.ptp(mesh.vertices, axis=0).max())
     if size < LEAST_SIZE_M:
-        raise InputError(f"{source}: expected a garment, found a mesh of {1e3 * size:.2g} mm; its units differ")
+        raise InputError(f"expected a garment, found a mesh of {1e3 * size:.2g} mm; its units differ", where=source)
     at, barycentric, weights, nearest = _bind(mesh, body)
     distance = float(np.median(np.linalg.norm(mesh.vertices - nearest, axis=1)))
     if distance > FAR_M:
         raise InputError(
-            f"{source}: expected a garment on the body, found it {1e3 * distance:.0f} mm off in the median; "
-            "its units, its place or the pose differ"
+            f"expected a garment on the body, found it {1e3 * distance:.0f} mm off in the median; "
+            "its units, its place or the pose differ",
+            where=source,
         )
     rest, flagged = unskin(mesh.vertices, weights, body.transforms)
     if flagged.any():
-        raise InputError(f"{source}: expected a pose that can be undone, found {flagged.sum()} vertices between limbs")
+        raise InputError(
+            f"expected a pose that can be undone, found {flagged.sum()} vertices between limbs", where=source
+        )
     loops = boundary_loops(mesh.faces)
     found = check_uv(mesh)
     kept, fresh = _choose_uv(mesh, found, uv, source)
@@ -124,17 +127,19 @@ def _require_surface(mesh: Mesh, source: str) -> None:
     edges, uses = edge_uses(mesh.faces)
     if (edges[:, 0] == edges[:, 1]).any():
         bad = int(np.flatnonzero((np.diff(np.sort(mesh.faces, axis=1), axis=1) == 0).any(axis=1))[0])
-        raise InputError(f"{source}: expected three different corners in every face, face {bad} uses one twice")
+        raise InputError(f"expected three different corners in every face, face {bad} uses one twice", where=source)
     if (uses > 2).any():
         count = int((uses > 2).sum())
-        raise InputError(f"{source}: expected at most two faces at an edge, found more at {count} of {len(uses)} edges")
+        raise InputError(
+            f"expected at most two faces at an edge, found more at {count} of {len(uses)} edges", where=source
+        )
     unused = len(mesh.vertices) - len(np.unique(mesh.faces))
     if unused:
-        raise InputError(f"{source}: expected every vertex in a face, found {unused} in none")
+        raise InputError(f"expected every vertex in a face, found {unused} in none", where=source)
     if not (uses == 1).any():
-        raise InputError(f"{source}: expected a garment with open borders, found a closed surface")
+        raise InputError("expected a garment with open borders, found a closed surface", where=source)
     if _has_mixed_winding(mesh):
-        raise InputError(f"{source}: expected faces wound alike, found neighbours wound against each other")
+        raise InputError("expected faces wound alike, found neighbours wound against each other", where=source)
 
 
 def _has_mixed_winding(mesh: Mesh) -> bool:
@@ -147,7 +152,7 @@ def _choose_uv(mesh: Mesh, found: UvReport, choice: UvChoice, source: str) -> tu
     if choice == "none":
         return None, False
     if choice == "keep" and faults:
-        raise InputError(f"{source}: expected UVs that can be kept, found {', '.join(faults)}")
+        raise InputError(f"expected UVs that can be kept, found {', '.join(faults)}", where=source)
     if choice == "fresh" or faults:
         return fresh_uv(mesh), True
     return mesh.uv, False
@@ -160,8 +165,8 @@ def _loop_names(
         return name_loops(loops, weights, rest, body)
     if len(names) != len(loops) or len(set(names)) != len(names):
         sizes = ", ".join(str(len(loop)) for loop in loops)
-        raise InputError(f"{source}: expected {len(loops)} different names for loops of {sizes} vertices, "
-                         f"found {len(names)}")  # fmt: skip
+        raise InputError(f"expected {len(loops)} different names for loops of {sizes} vertices, "
+                         f"found {len(names)}", where=source)  # fmt: skip
     return tuple(names)
 
 

@@ -58,7 +58,7 @@ def scan_points(
     on_edge, used = open_vertices(faces, len(vertices))
     usable = used & ~on_edge & normals.any(axis=1)
     if not usable.any():
-        raise InputError(f"{source}: expected a surface to track, found no faces")
+        raise InputError("expected a surface to track, found no faces", where=source)
     order = np.random.default_rng(0).permutation(np.flatnonzero(usable))
     cloth = labels[order] > 0
     kept = np.concatenate(

@@ -11,8 +11,6 @@ metrics.jsonl            the frames' metrics, one per line
 
 from __future__ import annotations
 
-import json
-import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -29,7 +27,15 @@ from capture4d.captures.capture import Capture, read_scan, scan_path
 from capture4d.captures.take_colours import KnownColours, take_colours
 from capture4d.errors import InputError
 from capture4d.files.arrays import ArrayFile
-from capture4d.files.atomic import file_digest, read_json, read_json_lines, write_bytes, write_json, write_npz
+from capture4d.files.atomic import (
+    file_digest,
+    nan_to_none,
+    read_json,
+    read_json_lines,
+    write_json,
+    write_json_lines,
+    write_npz,
+)
 from capture4d.files.records import load_body, save_body, save_poses
 from capture4d.runs.stage import Stage, StageResult, open_stage
 from capture4d.runs.workers import progress, run_jobs
@@ -279,7 +285,7 @@ def _save_refined(
 ) -> None:
     """Metrics first: the frame counts as done once its npz is there."""
     quality = refined.quality
-    numbers = {key: value if math.isfinite(value) else None for key, value in _numbers(quality).items()}
+    numbers = nan_to_none(_numbers(quality))
     before = read_json(stage.path / "times" / f"{frame_id:06d}.json")["cpu_s"]
     write_json(
         stage.frame_path(frame_id, ".json", folder="metrics"),
@@ -344,5 +350,4 @@ def _gather(capture: Capture, stage: Stage, config: TrackingConfig) -> None:
         ),
     )
     records = [read_json(stage.frame_path(frame_id, ".json", folder="metrics")) for frame_id in capture.frame_ids]
-    lines = [json.dumps(record) for record in _with_take(records, config.sequence)]
-    write_bytes(stage.path / "metrics.jsonl", ("\n".join(lines) + "\n").encode())
+    write_json_lines(stage.path / "metrics.jsonl", _with_take(records, config.sequence))

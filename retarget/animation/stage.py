@@ -9,7 +9,6 @@ registration/  stage.json, garment.npz, frames/000123.npz, metrics/000123.json, 
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -23,7 +22,8 @@ from capture4d.body.motion_files import read_motion, resample
 from capture4d.body.skinning import ShapedBody
 from capture4d.captures.work_folder import ANIMATE, VERDICTS, stack_vertices
 from capture4d.errors import InputError
-from capture4d.files.atomic import file_digest, read_json, write_bytes, write_json, write_npy, write_npz
+from capture4d.files.arrays import map_array
+from capture4d.files.atomic import file_digest, read_json, write_json, write_json_lines, write_npy, write_npz
 from capture4d.files.records import load_body, load_poses, save_body, save_garment, save_poses
 from capture4d.runs.stage import Stage, StageResult, open_stage
 from capture4d.runs.workers import run_jobs
@@ -80,7 +80,7 @@ def run(
     stage = _open(output, scene, config, digest, overwrite)
     path = stage.path / "coefficients.npy"
     if path.is_file():
-        coefficients = np.load(path, allow_pickle=False)
+        coefficients = map_array(path)
     else:
         regressor = known.regressors[name]
         coefficients = regressor.predict(control_vectors(regressor.layout, scene.motion))
@@ -281,7 +281,7 @@ def _write_frame(shared: _Motion, row: int, frame: AnimatedFrame) -> None:
 def _collect(stage: Stage, frame_ids: Sequence[int]) -> StageResult:
     stack_vertices(stage, frame_ids)
     records = [read_json(stage.frame_path(frame_id, ".json", folder="metrics")) for frame_id in frame_ids]
-    write_bytes(stage.path / "metrics.jsonl", "".join(json.dumps(each) + "\n" for each in records).encode())
+    write_json_lines(stage.path / "metrics.jsonl", records)
     frames = [stage.frame_path(frame_id) for frame_id in frame_ids]
     outputs = [stage.path / "garment.npz", stage.path / "vertices.npy", *frames]
     return stage.finish(outputs, frames=len(frame_ids))

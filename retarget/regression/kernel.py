@@ -191,7 +191,7 @@ def load_kernel(path: Path, *, model_digest: str) -> KernelRegressor:
     found = frames.shape, answers.shape
     if wanted != found or any(len(view) != layout.size for view in views):
         raise InputError(
-            f"{path}: expected learned frames of {wanted[0]} and {wanted[1]}, found {found[0]}, {found[1]}"
+            f"expected learned frames of {wanted[0]} and {wanted[1]}, found {found[0]}, {found[1]}", where=path
         )
     line, ridge = float(file.entry("line")), float(file.entry("ridge"))
     return KernelRegressor(layout, scales, views, shares, line, frames, answers, middle, ridge)

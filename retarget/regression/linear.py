@@ -135,5 +135,5 @@ def load_linear(path: Path, *, model_digest: str) -> LinearRegressor:
     matrix, intercept = file["matrix"], file["intercept"]
     inputs = layout.size + layout.config.history * len(intercept)
     if matrix.shape != (inputs, len(intercept)):
-        raise InputError(f"{path}: expected a matrix of {(inputs, len(intercept))}, found {matrix.shape}")
+        raise InputError(f"expected a matrix of {(inputs, len(intercept))}, found {matrix.shape}", where=path)
     return LinearRegressor(layout, scales, matrix, intercept, float(file.entry("ridge")))

@@ -178,5 +178,5 @@ def load_lstm(
     weights = {name: torch.from_numpy(each) for name, each in file.prefixed("network.").items()}
     load_weights(network, weights, source=path)
     if config.over_linear and linear is None:
-        raise InputError(f"{path}: expected the linear regression it was trained over beside it, found none")
+        raise InputError("expected the linear regression it was trained over beside it, found none", where=path)
     return LstmRegressor(layout, scales, config, network.to(placed).eval(), linear if config.over_linear else None)

@@ -75,7 +75,7 @@ def load_pose_range(path: Path, *, model_digest: str) -> PoseRange:
     """Raises InputError: the file is damaged, another kind, or belongs to another model."""
     file = read_tensors(path, _KIND)
     if file.entry("model") != model_digest:
-        raise InputError(f"{path}: expected the poses of the blendshapes beside it, found those of another model")
+        raise InputError("expected the poses of the blendshapes beside it, found those of another model", where=path)
     return PoseRange(
         file["quaternions"], tuple(int(joint) for joint in file.entry("joints")), float(file.entry("validated_deg"))
     )

@@ -277,10 +277,10 @@ def read_regressor(path: Path, kind: str, *, model_digest: str) -> tuple[TensorF
     """
     file = read_tensors(path, kind)
     if file.entry("model") != model_digest:
-        raise InputError(f"{path}: expected a regressor of the blendshapes beside it, found one of another model")
+        raise InputError("expected a regressor of the blendshapes beside it, found one of another model", where=path)
     for name, array in file.tensors.items():
         if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
-            raise InputError(f"{path}: expected finite numbers, found NaN or inf in '{name}'")
+            raise InputError(f"expected finite numbers, found NaN or inf in '{name}'", where=path)
     return file, _load_layout(file), Scales(file["control_mean"], file["control_std"], file["coefficient_std"])
 
 
@@ -291,7 +291,7 @@ def _load_layout(file: TensorFile) -> ControlLayout:
         config = ControlConfig(**{**entry["config"], "lags": tuple(entry["config"].get("lags", ()))})
         joints, parents = (tuple(int(joint) for joint in entry[name]) for name in ("joints", "parents"))
         return ControlLayout(tuple(entry["joint_names"]), joints, float(entry["fps"]), config, parents)
-    except (KeyError, TypeError) as error:
-        raise InputError(f"damaged description of the controls ({error})", where=file.path) from None
     except SettingError as fault:
         raise fault.at(file.path) from None
+    except Exception as error:  # whatever such JSON may hold instead
+        raise InputError(f"damaged description of the controls ({error})", where=file.path) from None

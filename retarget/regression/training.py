@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import contextlib
 import copy
-import json
 import math
 import time
 from collections.abc import Iterator, Sequence
@@ -25,7 +24,7 @@ from jaxtyping import Float, Float32
 from torch import Tensor
 
 from capture4d.errors import InputError
-from capture4d.files.atomic import write_bytes
+from capture4d.files.atomic import write_json_lines
 from capture4d.files.checkpoints import read_checkpoint, write_checkpoint
 from retarget.config import FitConfig, LstmConfig, TrainingConfig
 from retarget.regression.controls import ControlLayout
@@ -337,4 +336,4 @@ def _load(path: Path, state: TrainingState) -> None:
 
 
 def _write_metrics(path: Path, records: Sequence[dict[str, Any]]) -> None:
-    write_bytes(path, "".join(json.dumps(record, sort_keys=True) + "\n" for record in records).encode())
+    write_json_lines(path, records, sort_keys=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from capture4d.errors import InputError
+from capture4d.files.reading import reading
 from capture4d.files.tensors import read_tensors, write_tensors
 from capture4d.types import BlendshapeModel, Garment, Mesh
 
@@ -34,7 +34,7 @@ def save_blendshapes(path: str | Path, model: BlendshapeModel) -> None:
 def load_blendshapes(path: str | Path) -> BlendshapeModel:
     """Raises InputError that names the file, whatever is wrong with it."""
     file = read_tensors(path, _KIND)
-    try:
+    with reading(path, "blendshape model"):
         template = Mesh(file["template_vertices"], file["template_faces"], file.get("template_uv"))
         garment = Garment(
             template,
@@ -50,5 +50,3 @@ def load_blendshapes(path: str | Path) -> BlendshapeModel:
             fps=float(file.entry("fps")),
             licence=str(file.entry("licence")),
         )
-    except InputError as error:
-        raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None

@@ -12,6 +12,7 @@ from jaxtyping import Bool
 from torch.nn import functional
 
 from capture4d.errors import InputError
+from capture4d.files.reading import reading
 from capture4d.files.records import load_garment
 from capture4d.geometry.uv_raster import rasterise_uv
 from capture4d.runs.stage import complete_record
@@ -105,13 +106,9 @@ def open_pairs(work: Path) -> PairFolder:
     """
     folder = work / PAIRS
     record = complete_record(folder, MAPS, f"capture4d wrinkles maps {work}", former_names=FORMER_NAMES)
-    return PairFolder(
-        work,
-        record["digest"],
-        record["upstream"]["registration"],
-        MapConfig(**record["config"]["map"]),
-        load_garment(folder / "template.npz").template,
-    )
+    with reading(folder / "stage.json", "record of normal maps"):
+        registration, maps = record["upstream"]["registration"], MapConfig(**record["config"]["map"])
+    return PairFolder(work, record["digest"], registration, maps, load_garment(folder / "template.npz").template)
 
 
 def read_map(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -120,7 +117,5 @@ def read_map(path: Path) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         InputError: the file is missing or damaged.
     """
-    try:
+    with reading(path, "normal map"):
         return decode_png(path.read_bytes(), source=str(path))
-    except FileNotFoundError:
-        raise InputError("no such file", where=path) from None

@@ -82,9 +82,12 @@ def decode_png(data: bytes, *, source: str) -> tuple[Float32[np.ndarray, "H W 3"
     Raises:
         InputError: `source` is not a 16-bit colour PNG, cut off or damaged.
     """
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    except cv2.error:  # of a header that claims more than OpenCV reads
+        pixels = None
     if pixels is None or pixels.dtype != np.uint16 or pixels.ndim != 3:
-        raise InputError(f"{source}: expected a 16-bit colour PNG, found none, or one that is damaged")
+        raise InputError("expected a 16-bit colour PNG, found none, or one that is damaged", where=source)
     image = _decoded(pixels)
     valid = pixels[..., 3] > 32767 if pixels.shape[2] == 4 else np.ones(pixels.shape[:2], bool)
     return image, valid

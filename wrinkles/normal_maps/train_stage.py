@@ -11,7 +11,6 @@ takes.json                 digests of the registrations it learned from
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -21,7 +20,7 @@ import torch
 
 from capture4d.captures.work_folder import WorkFolder
 from capture4d.errors import InputError
-from capture4d.files.atomic import read_json, read_json_lines, write_bytes, write_json
+from capture4d.files.atomic import nan_to_none, read_json, read_json_lines, write_bytes, write_json, write_json_lines
 from capture4d.geometry.uv_layout import millimetres_per_texel
 from capture4d.runs.stage import Stage, StageResult, open_stage
 from capture4d.runs.workers import progress
@@ -196,7 +195,7 @@ def _logged(path: Path, step: int) -> list[dict[str, float]]:
 
 
 def _write_log(path: Path, rows: Sequence[dict[str, float]]) -> None:
-    write_bytes(path, "".join(json.dumps(row) + "\n" for row in rows).encode())
+    write_json_lines(path, map(nan_to_none, rows))
 
 
 def _write_samples(stage: Stage, state: TrainingState, held: list[PairTake], config: WrinkleConfig) -> None:
@@ -227,4 +226,4 @@ def _png(picture: np.ndarray) -> bytes:
 
 
 def _json(scores: MapScores) -> dict[str, float | None]:
-    return {name: value if np.isfinite(value) else None for name, value in asdict(scores).items()}
+    return nan_to_none(asdict(scores))

@@ -20,3 +20,10 @@ def test_an_error_travels_whole(kind, travel):
 def test_the_file_is_named_once_however_often_it_is_told():
     error = InputError("expected 3 numbers, found 2").at("a.json").at("b.json")
     assert str(error) == "b.json: expected 3 numbers, found 2"
+
+
+def test_a_line_is_told_with_its_file():
+    error = InputError("expected 3 numbers, found 2", line=7)
+    assert str(error) == "expected 3 numbers, found 2"
+    error = pickle.loads(pickle.dumps(error.at("a.obj")))
+    assert (str(error), error.where) == ("a.obj:7: expected 3 numbers, found 2", "a.obj")

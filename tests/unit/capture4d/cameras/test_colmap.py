@@ -1,15 +1,18 @@
 """COLMAP models: the same point through both, and there and back without a loss."""
 
+import struct
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from benchmarks.simulated_views import calibration_rig
-from capture4d.cameras.colmap import colmap_camera, lens_of, read_model, to_colmap_pixels, write_model
+from capture4d.cameras.colmap import colmap_camera, lens_of, read_model, sensor, to_colmap_pixels, write_model
 from capture4d.cameras.projection import project_world
 from capture4d.errors import InputError
 from capture4d.heavy_imports import import_pycolmap
@@ -115,3 +118,64 @@ def test_opencv_writes_png_after_pycolmap_has_been_imported(tmp_path: Path):
         "assert cv2.imwrite(sys.argv[1], np.zeros((64, 64, 3), np.uint8))"
     )
     subprocess.run([sys.executable, "-c", script, str(tmp_path / "x.png")], check=True, cwd=ROOT, capture_output=True)
+
+
+def test_a_model_is_read_as_pycolmap_reads_it(tmp_path: Path):
+    """A rig of two cameras that moves through three frames, and an image alone."""
+    pycolmap = import_pycolmap()
+    model = pycolmap.Reconstruction()
+    rng = np.random.default_rng(0)
+
+    def pose() -> Any:
+        turn = Rotation.from_rotvec(rng.normal(size=3)).as_matrix()
+        return pycolmap.Rigid3d(np.column_stack([turn, rng.normal(size=3)]))
+
+    rig = pycolmap.Rig(rig_id=1)
+    for camera_id in (1, 2):
+        parameters = [900.0 + camera_id, 901, 320.5, 240.5]
+        model.add_camera(
+            pycolmap.Camera(camera_id=camera_id, model="PINHOLE", width=640, height=480, params=parameters)
+        )
+        rig.add_ref_sensor(sensor(1)) if camera_id == 1 else rig.add_sensor(sensor(2), pose())
+    model.add_rig(rig)
+    for frame_id in (1, 2, 3):
+        frame = pycolmap.Frame(frame_id=frame_id, rig_id=1)
+        frame.rig_from_world = pose()
+        for camera_id in (1, 2):
+            frame.add_data_id(pycolmap.data_t(sensor(camera_id), 10 * frame_id + camera_id))
+        model.add_frame(frame)
+        for camera_id in (1, 2):
+            name = f"cam {camera_id}/{frame_id:03d}.png"
+            image = pycolmap.Image(name=name, camera_id=camera_id, image_id=10 * frame_id + camera_id)
+            image.frame_id = frame_id
+            model.add_image(image)
+        model.register_frame(frame_id)
+    for text in (False, True):
+        folder = tmp_path / str(text)
+        folder.mkdir()
+        (model.write_text if text else model.write)(folder)
+        found = read_model(folder)
+        assert found.names == ("cam 1", "cam 2")
+        expected = np.stack([model.images[number].cam_from_world().matrix() for number in (11, 12)])
+        np.testing.assert_allclose(found.T_camera_world[:, :3], expected, atol=1e-9)
+        for name in ("points3D", "rigs", "frames"):  # without frames, every image is a camera
+            (folder / name).with_suffix(".txt" if text else ".bin").unlink()
+        assert len(read_model(folder).names) == 6
+
+
+def test_images_without_their_lines_of_points_are_named(rig: Rig, tmp_path: Path):
+    write_model(tmp_path, rig, text=True)
+    path = tmp_path / "images.txt"
+    path.write_text("\n".join(line for line in path.read_text().splitlines() if line) + "\n")
+    with pytest.raises(InputError, match=r"images\.txt:\d+: not a readable COLMAP model, expected X Y POINT3D"):
+        read_model(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "frames.bin"])
+def test_counts_that_lie_are_one_line(name: str, rig: Rig, tmp_path: Path):
+    write_model(tmp_path, rig)
+    path = tmp_path / name
+    path.write_bytes(struct.pack("<Q", 2**62) + path.read_bytes()[8:])
+    with pytest.raises(InputError, match="not a readable COLMAP model") as caught:
+        read_model(tmp_path)
+    assert caught.value.where == str(path)

@@ -1,5 +1,6 @@
 """Mesh files as other programs write them, and as they should not be."""
 
+import re
 import struct
 from pathlib import Path
 
@@ -64,6 +65,7 @@ def test_polygons_and_uvs_survive_writing(tmp_path: Path, suffix: str):
         ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n", "bad.obj:4: expected an index from 1"),
         ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf -4 1 2\n", "bad.obj:4: expected an index"),
         ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1/7 2/7 3/7\n", "bad.obj:4: texture coordinate 7 does not exist"),
+        (f"v 0 0 0\nf 1 2 {9**40}\n", "bad.obj:2: expected an index of at most 2147483647"),
         ("v 0 0 0\nv 1 0 0\nf 1 2\n", "bad.obj:3: expected a face of at least 3 corners"),
         ("v 0 0 0\nv 1 0 0\nv 0 1 0\n", "bad.obj: empty mesh, found 3 vertices and no faces"),
         ("", "bad.obj: empty mesh"),
@@ -166,3 +168,81 @@ def test_a_texture_too_large_to_be_read_is_one_line(
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)
     with pytest.raises(InputError, match="too large"):
         read_coloured_mesh(path)
+
+
+TEXT = "ply\nformat ascii 1.0\n{before}element vertex 3\n{axes}{colours}element face 1\n{corners}end_header\n{body}"
+AXES = "property float x\nproperty float y\nproperty float z\n"
+POINTS = "0 0 0\n1 0 0\n0 1 0\n"
+LIST = "property list uchar int vertex_indices\n"
+BINARY = struct.pack("<9f", 0, 0, 0, 1, 0, 0, 0, 1, 0)
+
+
+def ply(corners: str = LIST, body: str = POINTS + "3 0 1 2\n", colours: str = "", before: str = "") -> bytes:
+    return TEXT.format(before=before, axes=AXES, colours=colours, corners=corners, body=body).encode()
+
+
+def binary(corners: str, body: bytes) -> bytes:
+    return ply(corners, "").replace(b"ascii", b"binary_little_endian") + BINARY + body
+
+
+RED = "property uchar red\nproperty uchar green\nproperty uchar blue\n"
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (ply("property int vertex_indices\n", POINTS + "3\n"), "expected a list of corners in every face"),
+        (ply("property list uchar float vertex_indices\n"), "expected whole numbers as vertex_indices"),
+        (ply("property list float int vertex_indices\n"), "damaged header"),
+        (ply(before="element vertex 1\nproperty float x\n"), "damaged header, cannot read 'element vertex 3'"),
+        (ply(body="0 0 0 300 0 0\n1 0 0 1 1 1\n0 1 0 1 1 1\n3 0 1 2\n", colours=RED), "expected red from 0 to 255"),
+        (ply(body=POINTS + "3 0 1 4e9\n"), "expected vertex_indices from -2147483648 to 2147483647, found 4e+09"),
+        (ply(body=POINTS + "3 0 1 1.5\n"), "found 1.5"),
+        (ply(body=POINTS + "3 0 1 nan\n"), "found nan"),
+        (binary("property list uint int vertex_indices\n", struct.pack("<I3i", 2**32 - 1, 0, 1, 2)), "cut off"),
+        (binary("property list int int vertex_indices\n", struct.pack("<i3i", -3, 0, 1, 2)), "cut off"),
+        (ply("", "").replace(b"face 1", b"face 0").replace(b"vertex 3", b"vertex 0"), "empty mesh"),
+    ],
+)
+def test_a_ply_that_lies_is_one_line(data: bytes, said: str, tmp_path: Path):
+    path = tmp_path / "x.ply"
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=re.escape(said)) as caught:
+        read_mesh(path)
+    assert caught.value.where == str(path)
+
+
+def test_a_ply_may_hold_more_than_a_mesh(tmp_path: Path):
+    path = tmp_path / "x.ply"
+    for data in (
+        ply(),
+        ply(before="element junk 4000000000\n"),
+        ply(before="element junk 4000000000\n").replace(b"ascii", b"binary_little_endian").partition(b"0 0 0")[0]
+        + BINARY + struct.pack("<B3i", 3, 0, 1, 2),
+        ply(colours="property list uchar uchar red\n", body="0 0 0 1 5\n1 0 0 2 5 5\n0 1 0 0\n3 0 1 2\n"),
+    ):  # fmt: skip
+        path.write_bytes(data)
+        found = read_mesh(path)
+        assert (found.mesh.faces.tolist(), found.colours) == ([[0, 1, 2]], None)
+
+
+def test_a_texture_lies_beside_its_mesh(tmp_path: Path):
+    from PIL import Image
+
+    (tmp_path / "inner" / "skins").mkdir(parents=True)
+    for place in (tmp_path / "t.png", tmp_path / "inner" / "skins" / "t.png"):
+        Image.new("RGB", (4, 4), (9, 8, 7)).save(place)
+    (tmp_path / "inner" / "e.png").write_text("%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\nshowpage\n")
+    path, materials = tmp_path / "inner" / "x.obj", tmp_path / "inner" / "x.mtl"
+    path.write_text("mtllib x.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n")
+    materials.write_text("newmtl a\nmap_Kd skins/t.png\n")
+    assert read_coloured_mesh(path).colours is not None
+    for name, said in (
+        ("../t.png", "x.obj: expected the texture beside it or in a folder below, found '../t.png'"),
+        (str(tmp_path / "t.png"), "expected the texture beside it"),
+        ("e.png", "e.png: not a readable image"),
+        ("none.png", "none.png: no such file, the texture of x.obj"),
+    ):
+        materials.write_text(f"newmtl a\nmap_Kd {name}\n")
+        with pytest.raises(InputError, match=re.escape(said)):
+            read_coloured_mesh(path)
