@@ -15,7 +15,7 @@ from capture4d import pipeline
 from capture4d.body.skinning import ShapedBody, with_shape
 from capture4d.captures.capture import Capture, read_capture
 from capture4d.captures.truth import read_truth_model, read_truth_vertices
-from capture4d.captures.work_folder import load_moving_body, load_records, load_registration
+from capture4d.captures.work_folder import load_records, load_registration, open_work
 from capture4d.evaluation import material_points
 from capture4d.files.records import load_poses
 from capture4d.types import Garment, PoseSequence, RegisteredSequence
@@ -83,7 +83,7 @@ def lesson(config: TrainingSetConfig, folder: Path, *, truth: bool, tracked: boo
             sequences.append(true_take(capture))
         else:
             (work,) = registered_takes(config, folder, [name], tracked=tracked, workers=workers)
-            body, poses = load_moving_body(work)
+            body, poses = open_work(work).require_posed_body()
             good = np.array([record["verdict"] == "good" for record in load_records(work / "registration")])
             sequences.append((load_registration(work / "registration"), with_shape(body, poses.shape), poses, good))
     learned = learned_takes(config)

@@ -20,7 +20,7 @@ from benchmarks.learning_takes import learned_takes, registered_takes, training_
 from benchmarks.metric import Metric
 from benchmarks.registered_work import QUICK_TAKE, registered_work
 from capture4d.body.skinning import with_shape
-from capture4d.captures.work_folder import load_moving_body, load_records, load_registration
+from capture4d.captures.work_folder import load_records, load_registration, open_work
 from capture4d.errors import InputError
 from capture4d.learning.networks import ImageDecoder
 from retarget.shapes.pose_normalisation import PoseRows
@@ -128,12 +128,12 @@ def _joints(work: Path) -> np.ndarray:
     garment = load_registration(work / "registration").garment
     if garment.skin_weights is None:
         raise InputError(f"{work}: expected a template that is bound to a body")
-    return pose_joints(load_moving_body(work)[1], garment.skin_weights)
+    return pose_joints(open_work(work).require_posed_body()[1], garment.skin_weights)
 
 
 def _frames(layout: OffsetLayout, work: Path, joints: np.ndarray, *, good_only: bool = False) -> OffsetFrames:
     sequence = load_registration(work / "registration")
-    body, poses = load_moving_body(work)
+    body, poses = open_work(work).require_posed_body()
     rows = PoseRows.match(sequence, with_shape(body, poses.shape), poses)
     frames = offset_frames(layout, body, rows.poses, np.array(sequence.vertices), joints)
     records = load_records(work / "registration")

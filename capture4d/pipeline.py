@@ -7,31 +7,64 @@ returns a `StageResult`. The number of workers never changes a result.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
+from capture4d.app.compare.config import CompareConfig
+from capture4d.calibration.config import CalibrationConfig, RigCheckConfig
 from capture4d.captures.capture import Capture, read_capture
 from capture4d.captures.work_folder import WorkFolder, open_work
 from capture4d.runs.stage import StageResult
+from capture4d.synthetic import scan, synth, synth_board
+from capture4d.templates.config import TemplateConfig
 from capture4d.tracking.config import TrackingConfig
-from registration.config import RegistrationConfig
+from registration.config import MeshRegistrationConfig, RegistrationConfig
+from retarget.config import AnimateConfig, FitConfig
+from wrinkles.normal_maps import config as wrinkle_config
+from wrinkles.normal_maps.config import ApplyConfig, PairConfig, WrinkleConfig
+from wrinkles.offset_images.config import OffsetConfig
 
-__all__ = ["extract", "register", "report", "run", "track"]
+if TYPE_CHECKING:
+    from capture4d.calibration.check import CameraCheck
+    from capture4d.calibration.stage import CalibrationResult
+    from capture4d.preflight.check import Checked
+    from capture4d.preflight.take_folder import Claims
+    from capture4d.templates.stage import TemplateResult
+    from registration.register_mesh import MeshRegistration
+    from retarget.animation.stage import Wearer
 
-Folder: TypeAlias = str | Path
+__all__ = [
+    "animate",
+    "calibrate",
+    "check",
+    "check_rig",
+    "compare",
+    "extract",
+    "fit",
+    "register",
+    "register_mesh",
+    "report",
+    "run",
+    "scan",
+    "synth",
+    "synth_board",
+    "template",
+    "track",
+    "wrinkles_apply",
+    "wrinkles_maps",
+    "wrinkles_offsets",
+    "wrinkles_train",
+]
 
-
-# --- a take ------------------------------------------------------------------------------------------------------
+Place: TypeAlias = str | Path
+AnyCapture: TypeAlias = Capture | Place
+AnyWork: TypeAlias = WorkFolder | Place
 
 
 def extract(
-    capture: Capture | Folder,
-    work: WorkFolder | Folder,
-    *,
-    learn_colours: bool = False,
-    workers: int = 1,
-    overwrite: bool = False,
+    capture: AnyCapture, work: AnyWork, *, learn_colours: bool = False, workers: int = 1, overwrite: bool = False
 ) -> StageResult:
     """Cut the garment out of every scan by its colour, and find its painted borders: WORK/garment.
 
@@ -46,8 +79,8 @@ def extract(
 
 
 def track(
-    capture: Capture | Folder,
-    work: WorkFolder | Folder,
+    capture: AnyCapture,
+    work: AnyWork,
     config: TrackingConfig | None = None,
     *,
     workers: int = 1,
@@ -62,8 +95,8 @@ def track(
 
 
 def register(
-    capture: Capture | Folder,
-    work: WorkFolder | Folder,
+    capture: AnyCapture,
+    work: AnyWork,
     config: RegistrationConfig | None = None,
     *,
     tracked: bool = False,
@@ -90,18 +123,14 @@ def register(
 
 
 def report(
-    work: WorkFolder | Folder,
-    *,
-    capture: Capture | Folder | None = None,
-    workers: int = 1,
-    overwrite: bool = False,
+    work: AnyWork, *, capture: AnyCapture | None = None, workers: int = 1, overwrite: bool = False
 ) -> StageResult:
     """Draw the report of a registered capture or an animated garment: WORK/report; the result's path is its page.
 
     Args:
         capture: the capture, if it is not where it was when it was registered.
     """
-    opened = work if isinstance(work, WorkFolder) else open_work(work)
+    opened = _work(work)
     if opened.is_animated:
         from capture4d.app.report.animation import run as animation_report
 
@@ -113,8 +142,8 @@ def report(
 
 
 def run(
-    capture: Capture | Folder,
-    work: WorkFolder | Folder,
+    capture: AnyCapture,
+    work: AnyWork,
     config: RegistrationConfig | None = None,
     *,
     tracking: TrackingConfig | None = None,
@@ -151,12 +180,267 @@ def _needs_tracking(capture: Capture) -> bool:
     return capture.template.skin_weights is not None and not (capture.path / "poses.npz").is_file()
 
 
-# --- folders -----------------------------------------------------------------------------------------------------
+def calibrate(
+    images: Place,
+    output: Place,
+    board: str,
+    config: CalibrationConfig | None = None,
+    *,
+    pattern: str = "{camera}/{pose}",
+    colmap: Place | None = None,
+    workers: int = 1,
+    overwrite: bool = False,
+) -> CalibrationResult:
+    """Calibrate a camera rig from images of a ChArUco board: rig.json, calibration.json and calibration.html.
+
+    Args:
+        output: rig.json to write; the others go beside it.
+        board: charuco:COLUMNSxROWS:SQUARE_MM:MARKER_MM:DICTIONARY.
+        pattern: how the images lie in the folder, without their ending.
+        colmap: folder for the rig as a COLMAP model as well.
+    """
+    from capture4d.app.report.calibration import write_page
+    from capture4d.calibration.stage import run as stage
+
+    result = stage(
+        Path(images),
+        Path(output),
+        board,
+        config or CalibrationConfig(),
+        pattern=pattern,
+        colmap=_maybe(colmap),
+        workers=workers,
+        overwrite=overwrite,
+    )
+    write_page(Path(output).with_name("calibration.html"), result.report)
+    return result
 
 
-def _capture(capture: Capture | Folder) -> Capture:
+def check_rig(
+    rig: Place,
+    images: Place,
+    config: RigCheckConfig | None = None,
+    *,
+    board: str | None = None,
+    pattern: str = "{camera}/{pose}",
+    workers: int = 1,
+) -> list[CameraCheck]:
+    """Tell of each camera whether it has moved since calibration, from one pose of the board.
+
+    Args:
+        board: if it is not the one of the calibration.json beside the rig.
+    """
+    from capture4d.calibration.stage import run_check
+
+    config = config or RigCheckConfig()
+    return run_check(Path(rig), Path(images), config, board=board, pattern=pattern, workers=workers)
+
+
+def check(
+    capture: Place,
+    output: Place | None = None,
+    claims: Claims | None = None,
+    *,
+    all_frames: bool = False,
+    workers: int = 1,
+) -> Checked:
+    """Look through a take before a night is spent on it: `.verdict.findings`, worst first.
+
+    Args:
+        capture: capture folder, or just a folder of scans.
+        output: folder for a corrected take, if anything has to be corrected; looks at every frame.
+        claims: what is said of the take, over what its folder says.
+    """
+    from capture4d.preflight.stage import run as stage
+
+    return stage(Path(capture), _maybe(output), claims, all_frames=all_frames, workers=workers)
+
+
+def template(
+    mesh: Place | None,
+    output: Place,
+    config: TemplateConfig | None = None,
+    *,
+    body: Place | None = None,
+    poses: Place | None = None,
+) -> TemplateResult:
+    """Make a template of a garment mesh, or of a part of the body: bound, its borders named, its UVs checked.
+
+    Args:
+        mesh: garment that lies on the body; None where `config` names a region of the body.
+        body: the body it lies on, a body.npz; the built-in one if None.
+        poses: motion file with the pose and the shape in which it lies there; the rest pose if None.
+    """
+    from capture4d.templates.stage import run as stage
+
+    return stage(
+        None if mesh is None else Path(mesh),
+        Path(output),
+        config or TemplateConfig(),
+        body=None if body is None else Path(body),
+        poses=None if poses is None else Path(poses),
+    )
+
+
+def register_mesh(
+    template: Place, scan: Place, output: Place, config: MeshRegistrationConfig | None = None
+) -> MeshRegistration:
+    """Register one mesh file to another; writes the result, and its measures as JSON beside it.
+
+    `capture4d.register_mesh` does it with arrays.
+    """
+    from capture4d.extraction.garment import painted_border
+    from registration.register_mesh import run as stage
+
+    config = config or MeshRegistrationConfig()
+    return stage(Path(template), Path(scan), Path(output), config, find_border=painted_border)
+
+
+def fit(
+    works: Sequence[AnyWork],
+    output: Place,
+    config: FitConfig | None = None,
+    *,
+    device: str = "cpu",
+    workers: int = 1,
+    overwrite: bool = False,
+) -> StageResult:
+    """Learn the garment from registered takes of one template and person: its blendshapes, and what drives them.
+
+    Args:
+        output: folder to write, WORK/retarget by custom.
+        device: where torch trains.
+    """
+    from retarget.fit_stage import run as stage
+
+    opened = [_work(work) for work in works]
+    return stage(opened, Path(output), config or FitConfig(), device=device, workers=workers, overwrite=overwrite)
+
+
+def animate(
+    model: Place,
+    poses: Place,
+    output: Place,
+    config: AnimateConfig | None = None,
+    *,
+    wearer: Wearer | None = None,
+    device: str = "cpu",
+    workers: int = 1,
+    overwrite: bool = False,
+) -> StageResult:
+    """Put a learned garment on a motion, and on another body: a sequence like a registered one.
+
+    Args:
+        model: what `fit` wrote.
+        poses: motion file, .npz or .bvh.
+        output: work folder; gets body/ and registration/.
+        wearer: another person; None is the captured one.
+    """
+    from retarget.animation.stage import Wearer as Person
+    from retarget.animation.stage import run as stage
+
+    config, wearer = config or AnimateConfig(), wearer or Person()
+    return stage(
+        Path(model), Path(poses), Path(output), config,
+        wearer=wearer, device=device, workers=workers, overwrite=overwrite,
+    )  # fmt: skip
+
+
+def wrinkles_maps(
+    work: AnyWork,
+    config: PairConfig | None = None,
+    *,
+    high_from: AnyWork | None = None,
+    workers: int = 1,
+    overwrite: bool = False,
+) -> StageResult:
+    """Make normal maps of a registered take, low ones from the template, high ones from its scans.
+
+    Args:
+        high_from: work folder of the same frames, with finished maps, whose high ones are taken.
+    """
+    from wrinkles.normal_maps.maps_stage import run as stage
+
+    lender = None if high_from is None else _work(high_from)
+    return stage(_work(work), config or PairConfig(), high_from=lender, workers=workers, overwrite=overwrite)
+
+
+def wrinkles_train(
+    works: Sequence[AnyWork],
+    output: Place,
+    config: WrinkleConfig | None = None,
+    *,
+    pairs: PairConfig | None = None,
+    workers: int = 1,
+    overwrite: bool = False,
+) -> StageResult:
+    """Train the network that turns low maps into high ones; makes their maps if need be.
+
+    Args:
+        config: the small preset if None.
+        workers: processes for the maps, threads for the training; equal numbers give equal weights.
+    """
+    from wrinkles.normal_maps.train_stage import run as stage
+
+    opened = [_work(work) for work in works]
+    return stage(
+        opened, Path(output), config or wrinkle_config.PRESETS["small"],
+        pairs=pairs, workers=workers, overwrite=overwrite,
+    )  # fmt: skip
+
+
+def wrinkles_apply(
+    model: Place, work: AnyWork, config: ApplyConfig | None = None, *, workers: int = 1, overwrite: bool = False
+) -> StageResult:
+    """Make tangent-space normal maps with wrinkles for a registered or animated take: WORK/wrinkles/generated."""
+    from wrinkles.normal_maps.apply_stage import run as stage
+
+    return stage(Path(model), _work(work), config or ApplyConfig(), workers=workers, overwrite=overwrite)
+
+
+def wrinkles_offsets(
+    work: AnyWork, config: OffsetConfig | None = None, *, workers: int = 1, overwrite: bool = False
+) -> StageResult:
+    """Learn offset images of a registered take from its poses, and a baseline: WORK/wrinkles/offsets."""
+    from wrinkles.offset_images.model_files import OFFSETS
+    from wrinkles.offset_images.stage import run as stage
+
+    opened = _work(work)
+    return stage(opened, opened.path / OFFSETS, config or OffsetConfig(), workers=workers, overwrite=overwrite)
+
+
+def compare(
+    work: AnyWork,
+    model: Place,
+    config: CompareConfig | None = None,
+    *,
+    garment_model: Place | None = None,
+    workers: int = 1,
+    overwrite: bool = False,
+) -> StageResult:
+    """Compare what was learned on the same held-out frames: WORK/compare; the result's path is its page.
+
+    Args:
+        model: what `wrinkles_train` wrote.
+        garment_model: what `fit` wrote; WORK/retarget, if there is one, by default.
+    """
+    from capture4d.app.compare.page import run as stage
+
+    learned, config = _maybe(garment_model), config or CompareConfig()
+    return stage(_work(work), Path(model), config, garment_model=learned, workers=workers, overwrite=overwrite)
+
+
+def _capture(capture: AnyCapture) -> Capture:
     return capture if isinstance(capture, Capture) else read_capture(capture)
 
 
-def _path(work: WorkFolder | Folder) -> Path:
+def _work(work: AnyWork) -> WorkFolder:
+    return work if isinstance(work, WorkFolder) else open_work(work)
+
+
+def _path(work: AnyWork) -> Path:
     return work.path if isinstance(work, WorkFolder) else Path(work)
+
+
+def _maybe(place: Place | None) -> Path | None:
+    return None if place is None else Path(place)

@@ -208,28 +208,3 @@ def stack_vertices(stage: Stage, frame_ids: Sequence[int]) -> None:
 def load_records(folder: Path) -> list[dict[str, Any]]:
     """The frames' measures and verdicts, from WORK/registration/metrics.jsonl."""
     return read_json_lines(folder / "metrics.jsonl")
-
-
-# TRANSITION
-def failed_frames(work: Path) -> set[int]:
-    return set(open_work(work).failed_frames)
-
-
-def registered_digest(work: Path) -> str:
-    return open_work(work).registered_digest
-
-
-def is_animated(work: Path) -> bool:
-    return open_work(work).is_animated
-
-
-def work_capture(work: Path) -> Capture:
-    return open_work(work).capture
-
-
-def load_moving_body(work: Path) -> tuple[Body, PoseSequence]:
-    return open_work(work).require_posed_body()
-
-
-def find_moving_body(work: Path) -> tuple[Body, PoseSequence] | None:
-    return open_work(work).posed_body

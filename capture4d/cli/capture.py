@@ -53,9 +53,9 @@ class Check:
     def __call__(self) -> int:
         import json
 
+        from capture4d import pipeline
         from capture4d.app.report.check import as_json, print_table, status
         from capture4d.preflight.fix import fixed_path
-        from capture4d.preflight.stage import run
         from capture4d.preflight.take_folder import Claims
 
         claims = Claims(
@@ -69,7 +69,7 @@ class Check:
             self.body,
         )
         output = fixed_path(self.capture) if self.fix else None
-        checked = run(self.capture, output, claims, all_frames=self.all, workers=self.workers)
+        checked = pipeline.check(self.capture, output, claims, all_frames=self.all, workers=self.workers)
         if self.json:
             print(json.dumps(as_json(checked), indent=2))
         else:
@@ -101,10 +101,10 @@ class Calibrate:
     config: Annotated[CalibrationConfig, arg(name="")] = field(default_factory=CalibrationConfig)
 
     def __call__(self) -> int:
-        from capture4d.app.report.calibration import print_calibration, write_page
-        from capture4d.calibration.stage import run
+        from capture4d import pipeline
+        from capture4d.app.report.calibration import print_calibration
 
-        result = run(
+        result = pipeline.calibrate(
             self.images,
             self.output,
             self.board,
@@ -115,8 +115,7 @@ class Calibrate:
             overwrite=self.overwrite,
         )
         print_calibration(result.report)
-        page = write_page(self.output.with_name("calibration.html"), result.report)
-        print(f"rig: {result.path}, report: {page}")
+        print(f"rig: {result.path}, report: {self.output.with_name('calibration.html')}")
         return GOOD
 
 
@@ -137,10 +136,10 @@ class CheckRig:
     config: Annotated[RigCheckConfig, arg(name="")] = field(default_factory=RigCheckConfig)
 
     def __call__(self) -> int:
+        from capture4d import pipeline
         from capture4d.app.report.calibration import print_check
-        from capture4d.calibration.stage import run_check
 
-        checks = run_check(
+        checks = pipeline.check_rig(
             self.rig, self.images, self.config, board=self.board, pattern=self.pattern, workers=self.workers
         )
         print_check(checks)

@@ -40,53 +40,26 @@ def run_demo(output: Path, *, workers: int, overwrite: bool = False) -> tuple[Pa
     the paths of the two reports."""
     from capture4d import pipeline
     from capture4d.app.compare.config import CompareConfig
-    from capture4d.app.compare.page import run as compare
-    from capture4d.captures.work_folder import open_work
-    from data_synth.config import PRESETS
-    from data_synth.stage import run as synthesise
+    from data_synth.config import PRESETS, BoardConfig
     from retarget.animation.stage import Wearer
-    from retarget.animation.stage import run as animate
-    from retarget.config import AnimateConfig, FitConfig, TrainingConfig
-    from retarget.fit_stage import run as fit
+    from retarget.config import FitConfig, TrainingConfig
     from wrinkles.normal_maps.config import PRESETS as WRINKLES
-    from wrinkles.normal_maps.train_stage import run as train_wrinkles
     from wrinkles.offset_images.config import OffsetConfig, OffsetTrainingConfig
-    from wrinkles.offset_images.stage import run as learn_offsets
 
-    synthesise(output / "capture", PRESETS["demo"], workers=workers, overwrite=overwrite)
-    _calibrate_demo(output / "capture" / "rig.json", output / "rig", workers=workers, overwrite=overwrite)
-    pipeline.run(output / "capture", output, tracked=True, draw=False, workers=workers, overwrite=overwrite)
-    quick = TrainingConfig(epochs=60, patience=20)
-    fit([open_work(output)], output / "retarget", FitConfig(training=quick), workers=workers, overwrite=overwrite)
+    capture, board, model = output / "capture", BoardConfig(poses=BOARD_POSES), output / "wrinkles" / "model"
+    how = {"workers": workers, "overwrite": overwrite}
+    pipeline.synth(capture, PRESETS["demo"], **how)
+    pipeline.synth_board(capture / "rig.json", output / "rig" / "board", board, **how)
+    pipeline.calibrate(output / "rig" / "board", output / "rig" / "rig.json", board.board, **how)
+    pipeline.run(capture, output, tracked=True, draw=False, **how)
+    pipeline.fit([output], output / "retarget", FitConfig(training=TrainingConfig(epochs=60, patience=20)), **how)
     network = WRINKLES["small"]
     network = replace(network, held_out=HELD_OUT, schedule=replace(network.schedule, steps=WRINKLE_STEPS))
-    train_wrinkles([open_work(output)], output / "wrinkles" / "model", network, workers=workers, overwrite=overwrite)
+    pipeline.wrinkles_train([output], model, network, **how)
     images = OffsetConfig(held_out=HELD_OUT, texels=128, training=OffsetTrainingConfig(epochs=60))
-    learn_offsets(open_work(output), output / "wrinkles" / "offsets", images, workers=workers, overwrite=overwrite)
-    shown = CompareConfig(held_out=HELD_OUT)
-    compare(open_work(output), output / "wrinkles" / "model", shown, workers=workers, overwrite=overwrite)
-    report = pipeline.report(output, capture=output / "capture", workers=workers, overwrite=overwrite)
-    animate(
-        output / "retarget",
-        output / "body" / "poses.npz",
-        output / "other",
-        AnimateConfig(),
-        wearer=Wearer(beta=OTHER_PERSON),
-        workers=workers,
-        overwrite=overwrite,
-    )
-    return report.path, pipeline.report(output / "other", workers=workers, overwrite=overwrite).path
-
-
-def _calibrate_demo(truth: Path, folder: Path, *, workers: int, overwrite: bool) -> None:
-    """Photograph a board with the true rig, and calibrate from the photographs alone."""
-    from capture4d.app.report.calibration import write_page
-    from capture4d.calibration.stage import run as calibrate
-    from data_synth.board.stage import run as photograph
-    from data_synth.config import BoardConfig
-
-    config = BoardConfig(poses=BOARD_POSES)
-    photograph(truth, folder / "board", config, workers=workers, overwrite=overwrite)
-    rig = folder / "rig.json"
-    calibrated = calibrate(folder / "board", rig, config.board, workers=workers, overwrite=overwrite)
-    write_page(folder / "calibration.html", calibrated.report)
+    pipeline.wrinkles_offsets(output, images, **how)
+    pipeline.compare(output, model, CompareConfig(held_out=HELD_OUT), **how)
+    report = pipeline.report(output, capture=capture, **how)
+    poses, other = output / "body" / "poses.npz", Wearer(beta=OTHER_PERSON)
+    pipeline.animate(output / "retarget", poses, output / "other", wearer=other, **how)
+    return report.path, pipeline.report(output / "other", **how).path

@@ -42,10 +42,10 @@ class Template:
     """Of the mesh."""
 
     def __call__(self) -> int:
-        from capture4d.templates.stage import run
+        from capture4d import pipeline
 
         config = TemplateConfig(self.frame, self.region, self.uv, self.names, self.units)
-        result = run(self.mesh, self.output, config, body=self.body, poses=self.poses)
+        result = pipeline.template(self.mesh, self.output, config, body=self.body, poses=self.poses)
         garment, report = result.garment, result.report
         loops = ", ".join(f"{name} ({len(loop)})" for name, loop in garment.loops.items())
         faults = ", ".join(report.uv.faults())
@@ -71,10 +71,9 @@ class RegisterMesh:
     config: Annotated[MeshRegistrationConfig, arg(name="")] = field(default_factory=MeshRegistrationConfig)
 
     def __call__(self) -> int:
-        from capture4d.extraction.garment import painted_border
-        from registration.register_mesh import run
+        from capture4d import pipeline
 
-        result = run(self.template, self.scan, self.output, self.config, find_border=painted_border)
+        result = pipeline.register_mesh(self.template, self.scan, self.output, self.config)
         print(f"registered: {self.output}, measures: {self.output.with_suffix('.json')}")
         quality = result.quality
         if quality.verdict != "good":

@@ -30,8 +30,7 @@ class Fit(StageOptions):
     config: Annotated[FitConfig, arg(name="")] = field(default_factory=FitConfig)
 
     def __call__(self) -> int:
-        from capture4d.captures.work_folder import open_work
-        from retarget.fit_stage import run
+        from capture4d import pipeline
 
         if not self.works:
             raise InputError("WORK: expected at least one work folder, found none")
@@ -39,9 +38,10 @@ class Fit(StageOptions):
         if self.output is None and others:
             raise InputError(f"--output: expected a work folder for what {1 + len(others)} takes give, found none")
         folder = (self.output or first) / "retarget"
-        works = [open_work(work) for work in (first, *others)]
-        run(works, folder, self.config, device=self.device, workers=self.workers, overwrite=self.overwrite)
-        print(f"model: {folder}")
+        result = pipeline.fit(
+            self.works, folder, self.config, device=self.device, workers=self.workers, overwrite=self.overwrite
+        )
+        print(f"model: {result.path}")
         return GOOD
 
 
@@ -64,9 +64,10 @@ class Animate(GradedOptions):
     config: Annotated[AnimateConfig, arg(name="")] = field(default_factory=AnimateConfig)
 
     def __call__(self) -> int:
-        from retarget.animation.stage import Wearer, run
+        from capture4d import pipeline
+        from retarget.animation.stage import Wearer
 
-        result = run(
+        result = pipeline.animate(
             self.model,
             self.poses,
             self.output,
@@ -76,5 +77,5 @@ class Animate(GradedOptions):
             workers=self.workers,
             overwrite=self.overwrite,
         )
-        print(f"registration: {self.output / 'registration'}")
+        print(f"registration: {result.path}")
         return self.graded(result)

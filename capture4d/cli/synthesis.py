@@ -38,21 +38,14 @@ class Synth(StageOptions):
     config: Annotated[synth_config.SynthConfig, arg(name="")] = field(default_factory=synth_config.SynthConfig)
 
     def __call__(self) -> int:
-        if self.preset in synth_config.TRAINING_SETS:
-            return self._training_set()
-        from data_synth.stage import run
+        from capture4d import pipeline
 
-        run(self.output, _with_sensor(self.config, self.scanner), workers=self.workers, overwrite=self.overwrite)
-        print(f"capture: {self.output}")
-        return GOOD
-
-    def _training_set(self) -> int:
-        from data_synth.training_set import run
-
-        if self.config != synth_config.SynthConfig() or self.scanner is not None:
+        chosen = synth_config.TRAINING_SETS.get(self.preset)
+        if chosen is not None and (self.config != synth_config.SynthConfig() or self.scanner is not None):
             raise InputError(f"--preset {self.preset}: expected no other settings, for its takes bring their own")
-        run(self.output, synth_config.TRAINING_SETS[self.preset], workers=self.workers, overwrite=self.overwrite)
-        print(f"captures: {self.output / 'takes'}")
+        config = chosen or _with_sensor(self.config, self.scanner)
+        result = pipeline.synth(self.output, config, workers=self.workers, overwrite=self.overwrite)
+        print(f"capture: {result.path}" if chosen is None else f"captures: {result.path / 'takes'}")
         return GOOD
 
 
@@ -72,9 +65,9 @@ class Scan(StageOptions):
     config: Annotated[ScanConfig, arg(name="")] = field(default_factory=ScanConfig)
 
     def __call__(self) -> int:
-        from data_synth.scan_stage import run
+        from capture4d import pipeline
 
-        run(
+        result = pipeline.scan(
             self.meshes,
             self.output,
             _with_sensor(self.config, self.scanner),
@@ -82,7 +75,7 @@ class Scan(StageOptions):
             workers=self.workers,
             overwrite=self.overwrite,
         )
-        print(f"capture: {self.output}")
+        print(f"capture: {result.path}")
         return GOOD
 
 
@@ -97,8 +90,8 @@ class SynthBoard(StageOptions):
     config: Annotated[synth_config.BoardConfig, arg(name="")] = field(default_factory=synth_config.BoardConfig)
 
     def __call__(self) -> int:
-        from data_synth.board.stage import run
+        from capture4d import pipeline
 
-        run(self.rig, self.images, self.config, workers=self.workers, overwrite=self.overwrite)
+        pipeline.synth_board(self.rig, self.images, self.config, workers=self.workers, overwrite=self.overwrite)
         print(f"board images: {self.images}")
         return GOOD

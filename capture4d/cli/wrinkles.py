@@ -34,12 +34,12 @@ class WrinklesMaps(StageOptions):
     config: Annotated[PairConfig, arg(name="")] = field(default_factory=PairConfig)
 
     def __call__(self) -> int:
-        from capture4d.captures.work_folder import open_work
-        from wrinkles.normal_maps.maps_stage import run
+        from capture4d import pipeline
 
-        lender = None if self.high_from is None else open_work(self.high_from)
-        run(open_work(self.work), self.config, high_from=lender, workers=self.workers, overwrite=self.overwrite)
-        print(f"maps: {self.work / 'wrinkles' / 'pairs'}")
+        result = pipeline.wrinkles_maps(
+            self.work, self.config, high_from=self.high_from, workers=self.workers, overwrite=self.overwrite
+        )
+        print(f"maps: {result.path}")
         return GOOD
 
 
@@ -59,12 +59,12 @@ class WrinklesTrain(StageOptions):
     """Processes for the maps, threads for the training; equal numbers give equal weights."""
 
     def __call__(self) -> int:
-        from capture4d.captures.work_folder import open_work
-        from wrinkles.normal_maps.train_stage import run
+        from capture4d import pipeline
 
-        works = [open_work(work) for work in self.works]
-        run(works, self.output, self.config, pairs=self.pairs, workers=self.workers, overwrite=self.overwrite)
-        print(f"model: {self.output}")
+        result = pipeline.wrinkles_train(
+            self.works, self.output, self.config, pairs=self.pairs, workers=self.workers, overwrite=self.overwrite
+        )
+        print(f"model: {result.path}")
         return GOOD
 
 
@@ -82,12 +82,11 @@ class WrinklesApply(StageOptions):
     """Per channel of the PNG files."""
 
     def __call__(self) -> int:
-        from capture4d.captures.work_folder import open_work
-        from wrinkles.normal_maps.apply_stage import ApplyConfig, run
+        from capture4d import pipeline
 
-        settings = ApplyConfig(flip_green=self.flip_green, bits=self.bits)
-        run(self.model, open_work(self.work), settings, workers=self.workers, overwrite=self.overwrite)
-        print(f"maps: {self.work / 'wrinkles' / 'generated' / 'frames'}")
+        config = wrinkle_config.ApplyConfig(flip_green=self.flip_green, bits=self.bits)
+        result = pipeline.wrinkles_apply(self.model, self.work, config, workers=self.workers, overwrite=self.overwrite)
+        print(f"maps: {result.path / 'frames'}")
         return GOOD
 
 
@@ -98,17 +97,14 @@ class WrinklesOffsets(StageOptions):
     work: Annotated[Positional[Path], arg(metavar="WORK")]
     """Work folder; holds registration/, gets wrinkles/offsets/."""
     config: Annotated[OffsetConfig, arg(name="")] = field(default_factory=OffsetConfig)
-    workers: int = field(default_factory=all_cores)
+    workers: Count = field(default_factory=all_cores)
     """Threads for the training; equal numbers give equal weights."""
 
     def __call__(self) -> int:
-        from capture4d.captures.work_folder import open_work
-        from wrinkles.offset_images.model_files import OFFSETS
-        from wrinkles.offset_images.stage import run
+        from capture4d import pipeline
 
-        work, output = open_work(self.work), self.work / OFFSETS
-        learned = run(work, output, self.config, workers=self.workers, overwrite=self.overwrite)
-        print(f"offset images: {learned.path}")
+        result = pipeline.wrinkles_offsets(self.work, self.config, workers=self.workers, overwrite=self.overwrite)
+        print(f"offset images: {result.path}")
         return GOOD
 
 
@@ -126,11 +122,10 @@ class Compare(StageOptions):
     config: Annotated[CompareConfig, arg(name="")] = field(default_factory=CompareConfig)
 
     def __call__(self) -> int:
-        from capture4d.app.compare.page import run
-        from capture4d.captures.work_folder import open_work
+        from capture4d import pipeline
 
-        compared = run(
-            open_work(self.work),
+        compared = pipeline.compare(
+            self.work,
             self.model,
             self.config,
             garment_model=self.garment_model,

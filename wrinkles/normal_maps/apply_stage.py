@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -23,25 +22,17 @@ from capture4d.files.records import save_garment
 from capture4d.geometry.tangents import corner_tangents
 from capture4d.runs.stage import Stage, StageResult, open_stage
 from capture4d.runs.workers import run_jobs
-from capture4d.settings import settings
+from wrinkles.normal_maps.config import ApplyConfig
 from wrinkles.normal_maps.inference import generator_path, load_model
 from wrinkles.normal_maps.pair_files import layout_digest
 from wrinkles.normal_maps.spaces import encode_png, encode_png8, flip_green
 from wrinkles.normal_maps.template import MapTemplate
 from wrinkles.normal_maps.wrinkle_maps import MapMaker
 
-__all__ = ["ApplyConfig", "run"]
+__all__ = ["run"]
 
 SCHEMA = 2
 CHUNK = 32
-
-
-@settings
-class ApplyConfig:
-    """The form of the maps."""
-
-    flip_green: bool = False
-    bits: Literal[8, 16] = 16
 
 
 @dataclass(frozen=True, slots=True, eq=False)

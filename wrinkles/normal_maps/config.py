@@ -10,6 +10,7 @@ from capture4d.settings import Count, Degrees, NonNegative, Odd, Part, Positive,
 
 __all__ = [
     "PRESETS",
+    "ApplyConfig",
     "AugmentationConfig",
     "LossConfig",
     "MapConfig",
@@ -143,6 +144,18 @@ _SMALL = WrinkleConfig(
     loss=LossConfig(temporal_kind="l2"),
     schedule=ScheduleConfig(steps=4000, batch=4, learning_rate=4e-4, half_precision=True),
 )
+
+
+@settings
+class ApplyConfig:
+    """The form of the maps."""
+
+    flip_green: bool = False
+    """Y downwards, as DirectX and Unreal want it, instead of OpenGL's."""
+    bits: Literal[8, 16] = 16
+    """Per channel of the PNG files."""
+
+
 PRESETS: Mapping[str, WrinkleConfig] = {
     "small": _SMALL,
     "small-256": replace(

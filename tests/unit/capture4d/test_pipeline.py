@@ -10,6 +10,7 @@ import pytest
 from capture4d import pipeline
 from capture4d.captures.capture import read_capture
 from capture4d.captures.work_folder import open_work
+from capture4d.cli.main import COMMANDS
 
 COUNT = """
 import json, os, sys
@@ -72,3 +73,10 @@ def test_stages_take_folders_open_or_by_path(tube_capture: Path, tmp_path: Path)
     assert not work.is_animated
     assert work.posed_body is None
     assert work.capture.path == tube_capture
+
+
+def test_every_command_has_a_function():
+    without = {"demo", "doctor", "convert-body", "convert-poses", "convert-rig"}  # files in, files out: no stages
+    wanted = {name.replace("-", "_").replace(" ", "_") for name in COMMANDS if name not in without}
+    assert wanted == set(pipeline.__all__)
+    assert all(callable(getattr(pipeline, name)) for name in wanted)

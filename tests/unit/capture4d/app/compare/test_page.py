@@ -10,7 +10,7 @@ import pytest
 
 from capture4d.app.compare.garment import model_take
 from capture4d.captures.capture import write_scan
-from capture4d.captures.work_folder import load_moving_body, load_registration
+from capture4d.captures.work_folder import load_registration, open_work
 from capture4d.cli.main import main
 from capture4d.errors import InputError
 from capture4d.types import Scan
@@ -220,7 +220,7 @@ def test_a_model_of_another_template_is_refused(compared: Path):
     turned = replace(garment.template, faces=garment.template.faces[::-1].copy(), uv=None)
     other = replace(known, model=replace(known.model, garment=replace(garment, template=turned)))
     with pytest.raises(InputError, match="expected a model of the template that was registered"):
-        model_take(other, sequence, *load_moving_body(work), [0])
+        model_take(other, sequence, *open_work(work).require_posed_body(), [0])
 
 
 @pytest.mark.parametrize(

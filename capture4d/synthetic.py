@@ -1,0 +1,60 @@
+"""Captures that nobody filmed, as functions by the names of their commands; `capture4d.pipeline` hands them on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TypeAlias
+
+from capture4d.runs.stage import StageResult
+from data_synth.config import BoardConfig, SynthConfig, TrainingSetConfig
+from data_synth.scanner.config import ScanConfig
+
+__all__ = ["scan", "synth", "synth_board"]
+
+Place: TypeAlias = str | Path
+
+
+def synth(
+    output: Place, config: SynthConfig | TrainingSetConfig, *, workers: int = 1, overwrite: bool = False
+) -> StageResult:
+    """Simulate a garment on a moving body and scan it: a capture folder with its exact truth.
+
+    Args:
+        config: one of `data_synth.config.PRESETS`, or of its TRAINING_SETS, which are many takes.
+    """
+    from data_synth.stage import run as stage
+    from data_synth.training_set import run as training_set
+
+    if isinstance(config, SynthConfig):
+        return stage(Path(output), config, workers=workers, overwrite=overwrite)
+    return training_set(Path(output), config, workers=workers, overwrite=overwrite)
+
+
+def scan(
+    meshes: Place,
+    output: Place,
+    config: ScanConfig | None = None,
+    *,
+    template: Place | None = None,
+    workers: int = 1,
+    overwrite: bool = False,
+) -> StageResult:
+    """Scan a mesh sequence with the virtual camera rig: a capture folder, with truth if the faces stay.
+
+    Args:
+        template: mesh to register later: lies on the first mesh, or is the same mesh in another pose.
+    """
+    from data_synth.scan_stage import run as stage
+
+    given = None if template is None else Path(template)
+    config = config or ScanConfig()
+    return stage(Path(meshes), Path(output), config, template=given, workers=workers, overwrite=overwrite)
+
+
+def synth_board(
+    rig: Place, images: Place, config: BoardConfig | None = None, *, workers: int = 1, overwrite: bool = False
+) -> StageResult:
+    """Photograph a calibration board with a virtual rig: IMAGES/CAMERA/POSE.png."""
+    from data_synth.board.stage import run as stage
+
+    return stage(Path(rig), Path(images), config or BoardConfig(), workers=workers, overwrite=overwrite)
