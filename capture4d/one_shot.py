@@ -13,7 +13,7 @@ import numpy as np
 
 from capture4d.captures.work_folder import WorkFolder, open_work
 from capture4d.errors import InputError
-from capture4d.types import Mesh, RegisteredSequence
+from capture4d.types import Garment, Mesh, RegisteredSequence
 from registration.config import MeshRegistrationConfig
 from registration.register_mesh import MeshRegistration
 from registration.register_mesh import register_mesh as register_normalised
@@ -21,7 +21,7 @@ from registration.register_mesh import register_mesh as register_normalised
 if TYPE_CHECKING:
     from retarget.animation.garment_model import GarmentModel
 
-__all__ = ["as_mesh", "load_garment_model", "load_registered", "register_mesh"]
+__all__ = ["as_mesh", "load_garment_model", "load_registered", "register_mesh", "wrinkle_map"]
 
 
 def register_mesh(
@@ -76,6 +76,26 @@ def load_garment_model(path: str | Path, *, device: str = "cpu") -> "GarmentMode
     from retarget.animation.garment_model import load_garment_model as load
 
     return load(path, device=device)
+
+
+def wrinkle_map(model: str | Path, vertices: Any, *, template: Garment | None = None) -> np.ndarray:
+    """The normal map with wrinkles that a trained network gives a posed garment: what `wrinkles apply` writes.
+
+    Args:
+        model: folder that `wrinkles train` wrote, or its generator.safetensors.
+        vertices: (V, 3) of the template that the network was trained on, posed, metres; or (T, V, 3), several frames.
+        template: a garment of that template, for models of early versions, which kept none.
+    Returns:
+        (S, S, 3) or (T, S, S, 3) float32: unit normals in tangent space, OpenGL's +Y; (0, 0, 1) where the map shows
+        nothing. `(map + 1) / 2` are the colours of an image.
+    Raises:
+        InputError: there is no such model, or it is of another template.
+    References:
+        DeepWrinkles (ECCV 2018), section 4.
+    """
+    from wrinkles.normal_maps.wrinkle_maps import wrinkle_map as made
+
+    return made(model, np.asarray(vertices, np.float32), template=template)
 
 
 def as_mesh(value: Any, name: str = "mesh") -> Mesh:
