@@ -98,7 +98,7 @@ class WrinklesOffsets(StageOptions):
     work: Annotated[Positional[Path], arg(metavar="WORK")]
     """Work folder; holds registration/, gets wrinkles/offsets/."""
     config: Annotated[OffsetConfig, arg(name="")] = field(default_factory=OffsetConfig)
-    workers: int = field(default_factory=all_cores)
+    workers: Count = field(default_factory=all_cores)
     """Threads for the training; equal numbers give equal weights."""
 
     def __call__(self) -> int:
