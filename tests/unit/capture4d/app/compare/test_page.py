@@ -10,7 +10,7 @@ import pytest
 
 from capture4d.app.compare.garment import model_take
 from capture4d.captures.capture import write_scan
-from capture4d.captures.work_folder import load_registration, open_work
+from capture4d.captures.work_folder import open_work
 from capture4d.cli.main import main
 from capture4d.errors import InputError
 from capture4d.types import Scan
@@ -215,12 +215,12 @@ def test_a_network_of_other_takes_leaves_the_split_to_the_offset_images(compared
 
 def test_a_model_of_another_template_is_refused(compared: Path):
     work = compared.parent
-    known, sequence = load_garment_model(work), load_registration(work / "registration")
+    known, taken = load_garment_model(work), open_work(work)
     garment = known.model.garment
     turned = replace(garment.template, faces=garment.template.faces[::-1].copy(), uv=None)
     other = replace(known, model=replace(known.model, garment=replace(garment, template=turned)))
     with pytest.raises(InputError, match="expected a model of the template that was registered"):
-        model_take(other, sequence, *open_work(work).require_posed_body(), [0])
+        model_take(other, taken.registered, *taken.require_posed_body(), [0])
 
 
 @pytest.mark.parametrize(
