@@ -95,7 +95,7 @@ class PairFolder:
             return torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).contiguous()
 
         masks = stacked([each[..., None] for each in valid])
-        return PairTake(self.work.name, frame_ids, stacked(low), stacked(high), masks)
+        return PairTake(self.work.resolve().name, frame_ids, stacked(low), stacked(high), masks)
 
 
 def open_pairs(work: Path) -> PairFolder:

@@ -64,7 +64,7 @@ def run(
     """
     if not works:
         raise InputError("wrinkles train: expected at least one work folder, found none")
-    if len({work.path.name for work in works}) < len(works):
+    if len({work.path.resolve().name for work in works}) < len(works):
         raise InputError("wrinkles train: expected work folders of different names, found two alike")
     folders = [_pairs(work, pairs, workers=workers) for work in works]
     first, *others = folders
@@ -79,12 +79,12 @@ def run(
     state = new_state(config)
     stage = open_stage(
         output, name="wrinkles train", former_names=("train-wrinkles",), schema=SCHEMA, config=config,
-        upstream={folder.work.name: folder.digest for folder in folders}, overwrite=overwrite,
+        upstream={folder.work.resolve().name: folder.digest for folder in folders}, overwrite=overwrite,
     )  # fmt: skip
     weights, measures = stage.path / "generator.safetensors", stage.path / "held_out.json"
     if stage.was_complete and weights.is_file() and measures.is_file():
         return stage.finish([weights], changed=False)
-    write_json(stage.path / TAKES, {folder.work.name: folder.registration for folder in folders})
+    write_json(stage.path / TAKES, {folder.work.resolve().name: folder.registration for folder in folders})
     recent = _resume(stage, state)
     _train(stage, state, recent, [train for train, _ in parts], [held for _, held in parts], config)
     model = WrinkleModel(

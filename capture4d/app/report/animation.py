@@ -69,7 +69,9 @@ def run(work: WorkFolder, *, workers: int = 1, overwrite: bool = False) -> Stage
         {"key": key, "value": value, "unit": ANIMATION_METRICS[key][0], "better": ANIMATION_METRICS[key][1]}
         for key, value in summary.items()
     ]
-    write_json(folder / "metrics.json", {"metrics": metrics, "capture": work.path.name, "frames": len(records)})
+    write_json(
+        folder / "metrics.json", {"metrics": metrics, "capture": work.path.resolve().name, "frames": len(records)}
+    )
     write_bytes(folder / "index.html", _page(work, records, summary, pictures).encode())
     return stage.finish([], output=folder / "index.html")
 
