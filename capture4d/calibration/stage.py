@@ -27,6 +27,7 @@ from capture4d.files.arrays import ArrayFile
 from capture4d.files.atomic import read_json, write_json, write_npz
 from capture4d.files.reading import reading
 from capture4d.files.records import load_rig, save_rig
+from capture4d.files.textures import holds_pixels
 from capture4d.runs.file_stage import open_file_stage
 from capture4d.runs.stage import StageResult
 from capture4d.runs.workers import run_jobs
@@ -240,8 +241,11 @@ def find_images(folder: Path, pattern: str = PATTERN) -> list[BoardImage]:
 
 def _detect(board: Board, image: BoardImage) -> _Detection:
     with reading(image.path, "image"):
-        data = np.frombuffer(image.path.read_bytes(), np.uint8)
-        picture = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+        data = image.path.read_bytes()
+        picture = None
+        if holds_pixels(data):
+            kind = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+            picture = cv2.imdecode(np.frombuffer(data, np.uint8), kind)
         if picture is None:
             raise InputError("not a readable image, cut off or damaged")
     ids, pixels = detect_corners(picture, board)

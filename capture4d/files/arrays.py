@@ -19,9 +19,9 @@ from capture4d.errors import InputError
 from capture4d.files.reading import one_line, reading
 from capture4d.types import Mesh
 
-__all__ = ["ArrayFile", "map_array", "mesh_arrays"]
+__all__ = ["DEFLATE_RATIO", "ArrayFile", "map_array", "mesh_arrays"]
 
-_DEFLATE_RATIO = 1032
+DEFLATE_RATIO = 1032
 """Nothing that deflate packed is longer than this many times its bytes (zlib's technical notes)."""
 
 _CHUNK = 1 << 24
@@ -70,7 +70,7 @@ class ArrayFile:
             )
         info = self._members[name]
         try:
-            if info.compress_size > self._bytes or info.file_size > _DEFLATE_RATIO * info.compress_size + 64:
+            if info.compress_size > self._bytes or info.file_size > DEFLATE_RATIO * info.compress_size + 64:
                 raise InputError(f"{info.compress_size} of {self._bytes} bytes that claim to be {info.file_size}")
             with self._archive.open(info) as file:
                 assert isinstance(file, io.BufferedIOBase)

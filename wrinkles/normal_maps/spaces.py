@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, UInt8, UInt16
 
 from capture4d.errors import InputError
+from capture4d.files.textures import holds_pixels
 
 __all__ = [
     "decode_png",
@@ -83,7 +84,8 @@ def decode_png(data: bytes, *, source: str) -> tuple[Float32[np.ndarray, "H W 3"
         InputError: `source` is not a 16-bit colour PNG, cut off or damaged.
     """
     try:
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+        whole = data and holds_pixels(data)
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if whole else None
     except cv2.error:  # of a header that claims more than OpenCV reads
         pixels = None
     if pixels is None or pixels.dtype != np.uint16 or pixels.ndim != 3:

@@ -1,11 +1,14 @@
 """Maps on disk, across seams and with holes."""
 
+import struct
+import zlib
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from capture4d.errors import InputError
+from capture4d.files.textures import holds_pixels
 from capture4d.types import Garment, Mesh
 from wrinkles.normal_maps.config import MapConfig
 from wrinkles.normal_maps.display import fill_holes
@@ -95,3 +98,17 @@ def test_holes_are_filled_from_around_and_nothing_else_changes():
     assert np.abs(filled - image)[~valid].max() < 0.15
     assert np.ptp(filled[~valid][:, 2]) < 1e-5
     assert not fill_holes(image, np.zeros_like(valid)).any()
+
+
+def test_a_png_that_claims_more_than_it_holds_is_not_decoded():
+    """OpenCV makes room for the pixels first: up to 8 GB."""
+    data = bytearray(encode_png(np.zeros((4, 4, 3), np.float32)))
+    data[16:24] = struct.pack(">II", 10_000, 10_000)
+    data[29:33] = struct.pack(">I", zlib.crc32(data[12:29]))
+    with pytest.raises(InputError, match="one that is damaged"):
+        decode_png(bytes(data), source="x.png")
+    assert not holds_pixels(bytes(data))
+    long = bytearray(encode_png(np.zeros((4, 4, 3), np.float32)))
+    long[33:37] = struct.pack(">I", 2**31 - 1)
+    assert not holds_pixels(bytes(long)), "a part of 2 GB"
+    assert holds_pixels(encode_png(np.zeros((3000, 3000, 3), np.float32)))
