@@ -11,7 +11,7 @@ import json
 import os
 import shutil
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import partial
@@ -22,6 +22,9 @@ from capture4d.errors import InputError, StaleError
 from capture4d.files.atomic import TEMPORARY_SUFFIX, file_digest, plain_value, read_json, write_json
 
 __all__ = ["Stage", "StageResult", "complete_record", "differences", "open_stage", "require_complete", "result_of"]
+
+FORMER_NAMES = {"wrinkles maps": "pairs", "wrinkles train": "train-wrinkles", "wrinkles apply": "wrinkles"}
+"""Names that stages have had: a folder that bears one is read, and continued, as the stage's own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +116,6 @@ def open_stage(
     upstream: Mapping[str, str],
     sources: Mapping[str, Path] | None = None,
     formerly: Mapping[str, str] | None = None,
-    former_names: Sequence[str] = (),
     overwrite: bool = False,
 ) -> Stage:
     """Open an output folder, new or to be continued.
@@ -125,7 +127,6 @@ def open_stage(
         upstream: digest of each input, by name.
         sources: where the inputs lie, for later stages and for people. Inputs may be moved, so this decides nothing.
         formerly: an earlier `upstream` whose results still hold; a folder that was made from it is taken over.
-        former_names: that the stage has had; folders that bear one are its own.
         overwrite: start clean; deletes everything in the folder, if it is this stage's.
     Raises:
         InputError: the folder holds something else.
@@ -142,7 +143,7 @@ def open_stage(
     if folder.exists() and not folder.is_dir():
         raise InputError("expected a folder to write to, found a file", where=folder)
     existing = read_json(record_path) if record_path.exists() else None
-    if existing is not None and existing.get("stage") in former_names:
+    if existing is not None and existing.get("stage") == FORMER_NAMES.get(name):
         existing = {**existing, "stage": name}
     if existing is None and folder.is_dir() and not _is_blank(folder):
         raise InputError(f"expected an empty folder or an earlier run of '{name}', found other files", where=folder)
@@ -179,10 +180,9 @@ def require_complete(
     command: str,
     *,
     made_from: Mapping[str, str] | None = None,
-    former_names: Sequence[str] = (),
 ) -> str:
     """The digest of a finished stage; `complete_record` has the arguments."""
-    return complete_record(folder, name, command, made_from=made_from, former_names=former_names)["digest"]
+    return complete_record(folder, name, command, made_from=made_from)["digest"]
 
 
 def complete_record(
@@ -191,13 +191,11 @@ def complete_record(
     command: str,
     *,
     made_from: Mapping[str, str] | None = None,
-    former_names: Sequence[str] = (),
 ) -> Mapping[str, Any]:
     """The stage.json of a finished stage: its `digest`, the `config` and the `upstream` it was made with.
 
     Args:
         made_from: digests of inputs that it has to have been made from, by name.
-        former_names: that the stage has had.
     Raises:
         InputError: it is missing or unfinished; the message names `command`, which repairs that.
         StaleError: it was made from something else.
@@ -206,7 +204,7 @@ def complete_record(
     if not (folder / "stage.json").is_file():
         raise InputError(f"expected the output of '{name}', found none; run: {command}", where=folder)
     record = read_json(folder / "stage.json")
-    if record.get("stage") not in (name, *former_names):
+    if record.get("stage") not in (name, FORMER_NAMES.get(name)):
         raise InputError(f"expected the output of '{name}', found output of '{record.get('stage')}'", where=folder)
     if record.get("status") != "complete":
         raise InputError(f"'{name}' is not finished; run: {command}", where=folder)

@@ -20,7 +20,7 @@ from jaxtyping import Float, Float32
 from torch import Tensor, nn
 
 from capture4d.errors import InputError
-from capture4d.files.checkpoints import load_weights
+from capture4d.learning.checkpoints import load_weights
 from capture4d.settings import SettingError
 from retarget.config import LstmConfig
 from retarget.regression.controls import ControlLayout

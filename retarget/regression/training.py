@@ -25,7 +25,7 @@ from torch import Tensor
 
 from capture4d.errors import InputError
 from capture4d.files.atomic import write_json_lines
-from capture4d.files.checkpoints import read_checkpoint, write_checkpoint
+from capture4d.learning.checkpoints import read_checkpoint, write_checkpoint
 from retarget.config import FitConfig, LstmConfig, TrainingConfig
 from retarget.regression.controls import ControlLayout
 from retarget.regression.linear import LinearRegressor, fit_linear

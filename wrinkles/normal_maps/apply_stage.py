@@ -64,7 +64,7 @@ def run(
                          where=work.path)  # fmt: skip
     upstream = {"registration": digest, "model": file_digest([weights], root=weights.parent)}
     stage = open_stage(
-        work.path / "wrinkles" / "generated", name="wrinkles apply", former_names=("wrinkles",), schema=SCHEMA,
+        work.path / "wrinkles" / "generated", name="wrinkles apply", schema=SCHEMA,
         config=config, upstream=upstream, overwrite=overwrite,
     )  # fmt: skip
     garment, tangents = stage.path / "template.npz", stage.path / "tangents.npy"

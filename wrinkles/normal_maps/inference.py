@@ -14,8 +14,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from capture4d.errors import InputError
-from capture4d.files.checkpoints import load_weights
 from capture4d.files.tensors import read_tensors, write_tensors
+from capture4d.learning.checkpoints import load_weights
 from capture4d.types import Mesh
 from wrinkles.normal_maps.config import MapConfig, NetworkConfig
 from wrinkles.normal_maps.networks import UNet, set_test_statistics

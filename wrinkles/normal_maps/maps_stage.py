@@ -27,7 +27,7 @@ from capture4d.runs.stage import Stage, StageResult, open_stage, require_complet
 from capture4d.runs.workers import run_jobs, shared
 from capture4d.types import Mesh, RegisteredSequence
 from wrinkles.normal_maps.config import PairConfig
-from wrinkles.normal_maps.pair_files import FORMER_NAMES, MAPS, PAIRS, PairFolder, layout_digest, open_pairs
+from wrinkles.normal_maps.pair_files import MAPS, PAIRS, PairFolder, layout_digest, open_pairs
 from wrinkles.normal_maps.spaces import decode_png, encode_png
 from wrinkles.normal_maps.template import FramePair, MapTemplate, frame_pairs
 
@@ -76,7 +76,7 @@ def run(
     upstream, sequence = _inputs(work), work.registered
     fps, template = work.capture.fps, MapTemplate.create(sequence.garment, config.map)
     stage = open_stage(
-        work.path / PAIRS, name=MAPS, former_names=FORMER_NAMES, schema=SCHEMA, config=config, upstream=upstream,
+        work.path / PAIRS, name=MAPS, schema=SCHEMA, config=config, upstream=upstream,
         overwrite=overwrite,
     )  # fmt: skip
     if not (stage.path / "template.npz").is_file():
@@ -111,7 +111,7 @@ def _borrow(work: WorkFolder, lender: WorkFolder, config: PairConfig, *, overwri
             f"expected frames of {work.path}, found none of its {len(sequence.frame_ids)}", where=lender.path
         )
     stage = open_stage(
-        work.path / PAIRS, name=MAPS, former_names=FORMER_NAMES, schema=SCHEMA, config=config,
+        work.path / PAIRS, name=MAPS, schema=SCHEMA, config=config,
         upstream={"registration": digest, "pairs": lent.digest}, sources={"pairs": lent.path}, overwrite=overwrite,
     )  # fmt: skip
     if not (stage.path / "template.npz").is_file():

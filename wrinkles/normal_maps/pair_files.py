@@ -21,11 +21,11 @@ from wrinkles.normal_maps.config import MapConfig
 from wrinkles.normal_maps.pairs import PairTake
 from wrinkles.normal_maps.spaces import decode_png
 
-__all__ = ["FORMER_NAMES", "MAPS", "PAIRS", "PairFolder", "layout_digest", "open_pairs", "read_map", "surface_texels"]
+__all__ = ["MAPS", "PAIRS", "PairFolder", "layout_digest", "open_pairs", "read_map", "surface_texels"]
 
 PAIRS = Path("wrinkles", "pairs")
 """Where they lie in a work folder."""
-MAPS, FORMER_NAMES = "wrinkles maps", ("pairs",)
+MAPS = "wrinkles maps"
 """The stage that makes them."""
 
 
@@ -105,7 +105,7 @@ def open_pairs(work: Path) -> PairFolder:
         InputError: they are missing or unfinished.
     """
     folder = work / PAIRS
-    record = complete_record(folder, MAPS, f"capture4d wrinkles maps {work}", former_names=FORMER_NAMES)
+    record = complete_record(folder, MAPS, f"capture4d wrinkles maps {work}")
     with reading(folder / "stage.json", "record of normal maps"):
         registration, maps = record["upstream"]["registration"], MapConfig(**record["config"]["map"])
     return PairFolder(work, record["digest"], registration, maps, load_garment(folder / "template.npz").template)

@@ -78,7 +78,7 @@ def run(
     torch.set_num_threads(workers)
     state = new_state(config)
     stage = open_stage(
-        output, name="wrinkles train", former_names=("train-wrinkles",), schema=SCHEMA, config=config,
+        output, name="wrinkles train", schema=SCHEMA, config=config,
         upstream={folder.work.resolve().name: folder.digest for folder in folders}, overwrite=overwrite,
     )  # fmt: skip
     weights, measures = stage.path / "generator.safetensors", stage.path / "held_out.json"

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from capture4d.errors import InputError
-from capture4d.files.checkpoints import read_checkpoint, write_checkpoint
+from capture4d.learning.checkpoints import read_checkpoint, write_checkpoint
 from wrinkles.normal_maps.config import LossConfig, ScheduleConfig, WrinkleConfig
 from wrinkles.normal_maps.losses import data_loss, gan_loss, temporal_loss
 from wrinkles.normal_maps.networks import PatchDiscriminator, UNet

@@ -13,8 +13,8 @@ from jaxtyping import Int
 
 from capture4d.errors import InputError
 from capture4d.files.atomic import read_json
-from capture4d.files.checkpoints import load_weights
 from capture4d.files.tensors import read_tensors, write_tensors
+from capture4d.learning.checkpoints import load_weights
 from capture4d.learning.networks import ImageDecoder
 from capture4d.runs.stage import complete_record
 from wrinkles.offset_images.networks import PcaFullyConnected, image_decoder

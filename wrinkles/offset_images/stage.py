@@ -27,7 +27,7 @@ from torch import Tensor
 from capture4d.captures.work_folder import WorkFolder
 from capture4d.errors import InputError
 from capture4d.files.atomic import write_bytes, write_json
-from capture4d.files.checkpoints import read_checkpoint, write_checkpoint
+from capture4d.learning.checkpoints import read_checkpoint, write_checkpoint
 from capture4d.runs.stage import Stage, StageResult, open_stage
 from capture4d.runs.workers import progress
 from wrinkles.frame_split import split_rows

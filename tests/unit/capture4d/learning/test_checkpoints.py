@@ -8,8 +8,8 @@ from torch import Tensor, nn
 
 from capture4d.errors import InputError
 from capture4d.files.atomic import write_bytes
-from capture4d.files.checkpoints import read_checkpoint, write_checkpoint
 from capture4d.files.tensors import read_tensors, write_tensors
+from capture4d.learning.checkpoints import read_checkpoint, write_checkpoint
 
 KIND, COMMAND = "test training", "capture4d learn"
 
