@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TypeAlias
 
+from capture4d.errors import InputError
 from capture4d.runs.stage import StageResult
-from data_synth.config import BoardConfig, SynthConfig, TrainingSetConfig
+from data_synth.config import PRESETS, TRAINING_SETS, BoardConfig, SynthConfig, TrainingSetConfig
 from data_synth.scanner.config import ScanConfig
 
 __all__ = ["scan", "synth", "synth_board"]
@@ -15,16 +16,24 @@ Place: TypeAlias = str | Path
 
 
 def synth(
-    output: Place, config: SynthConfig | TrainingSetConfig, *, workers: int = 1, overwrite: bool = False
+    output: Place, config: SynthConfig | TrainingSetConfig | str = "demo", *, workers: int = 1, overwrite: bool = False
 ) -> StageResult:
     """Simulate a garment on a moving body and scan it: a capture folder with its exact truth.
 
     Args:
-        config: one of `data_synth.config.PRESETS`, or of its TRAINING_SETS, which are many takes.
+        config: name of a preset, such as "tiny" or "tshirt-200k", or of a training set, which is many takes; or the
+            settings themselves.
+    Raises:
+        InputError: there is no such preset, or the folder holds something else.
     """
     from data_synth.stage import run as stage
     from data_synth.training_set import run as training_set
 
+    if isinstance(config, str):
+        known: dict[str, SynthConfig | TrainingSetConfig] = {**PRESETS, **TRAINING_SETS}
+        if config not in known:
+            raise InputError(f"config: expected one of {', '.join(known)}, found '{config}'")
+        config = known[config]
     if isinstance(config, SynthConfig):
         return stage(Path(output), config, workers=workers, overwrite=overwrite)
     return training_set(Path(output), config, workers=workers, overwrite=overwrite)

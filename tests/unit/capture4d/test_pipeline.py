@@ -11,6 +11,7 @@ from capture4d import pipeline
 from capture4d.captures.capture import read_capture
 from capture4d.captures.work_folder import open_work
 from capture4d.cli.main import COMMANDS
+from capture4d.errors import InputError
 
 COUNT = """
 import json, os, sys
@@ -80,3 +81,8 @@ def test_every_command_has_a_function():
     wanted = {name.replace("-", "_").replace(" ", "_") for name in COMMANDS if name not in without}
     assert wanted == set(pipeline.__all__)
     assert all(callable(getattr(pipeline, name)) for name in wanted)
+
+
+def test_a_preset_that_is_not_there_is_one_line(tmp_path: Path):
+    with pytest.raises(InputError, match=r"^config: expected one of demo, .*tshirt-train.*, found 'dem'$"):
+        pipeline.synth(tmp_path, "dem")
