@@ -1,7 +1,7 @@
 """SMPL-family bodies from the user's own licensed files, turned into this project's plain arrays once.
 
 SMPL, SMPL+H and SMPL-X are distributed to registered users as .npz or .pkl. A pickle can run code when it is loaded;
-this reader runs none of it, and builds nothing that the file names (see `capture4d.files.pickled_arrays`).
+this reader runs none of it, and builds nothing that the file names (see `capture4d.body.pickled_arrays`).
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from capture4d.body.pickled_arrays import read_pickled_arrays
 from capture4d.errors import InputError
 from capture4d.files.arrays import ArrayFile
-from capture4d.files.pickled_arrays import read_pickled_arrays
 from capture4d.files.reading import reading
 from capture4d.files.records import save_body
 from capture4d.types import Body, Mesh

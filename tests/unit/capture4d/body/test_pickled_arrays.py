@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy import sparse
 
+from capture4d.body.pickled_arrays import read_pickled_arrays
 from capture4d.errors import InputError
-from capture4d.files.pickled_arrays import read_pickled_arrays
 
 RNG = np.random.default_rng(8)
 PARTS = RNG.random((4, 6)) * (RNG.random((4, 6)) < 0.4)
