@@ -198,7 +198,7 @@ def _value_of(option: str, arguments: list[str]) -> str | None:
 
 def _overview(group: str = "") -> str:
     lines = [
-        f"  {name:<16} {(command.__doc__ or '').splitlines()[0]}"
+        f"  {name:<17} {(command.__doc__ or '').splitlines()[0]}"
         for name, command in COMMANDS.items()
         if name.startswith(group)
     ]

@@ -22,6 +22,7 @@ from capture4d.files.ply import ply_bytes
 from capture4d.files.records import load_garment, save_garment, save_poses
 from capture4d.runs.stage import StageResult
 from capture4d.types import Mesh, PoseSequence
+from data_synth.config import SynthConfig
 from tests.command_line import fails, run
 
 
@@ -71,10 +72,13 @@ def test_a_wrong_command_line_is_exit_2(arguments: list[str], capsys: pytest.Cap
 
 
 def test_the_scanner_is_chosen_in_one_word(monkeypatch: pytest.MonkeyPatch):
-    import data_synth.stage
-
     seen = []
-    monkeypatch.setattr(data_synth.stage, "run", lambda output, config, **_: seen.append(config.scanner.sensor))
+
+    def synth(output: Path, config: SynthConfig, **_: object) -> StageResult:
+        seen.append(config.scanner.sensor)
+        return StageResult(output, "")
+
+    monkeypatch.setattr(pipeline, "synth", synth)
     for chosen in ((), ("--scanner", "stereo"), ("--scanner.sensor", "stereo")):
         assert run("synth", "take", "--preset", "tiny", *chosen) == 0
     assert seen == ["depth", "stereo", "stereo"]

@@ -17,6 +17,7 @@ INPUTS = {
     "animate": ("no-model", "--poses", "no-poses.npz", "--output", "out"),
     "check": ("no-capture",),
     "compare": ("no-work", "--model", "no-model"),
+    "wrinkles offsets": ("no-work",),
     "convert-poses": ("no.bvh", "out.npz"),
     "register-mesh": ("no.ply", "no.ply", "--output", "out.ply"),
 }
@@ -54,7 +55,7 @@ SAME = "--coarse.compression 2 --dense.compression"  # two classes, one field na
         ("fit", "--kernel.ridges 1 0", "--kernel.ridges: expected a positive number, found 0"),
         ("fit", "--kernel.control.history 2", "--kernel.control.history: expected 0, for kernels carry nothing on"),
         ("animate", "--beta nan", "--beta: expected a finite number, found nan"),
-        ("compare", "--image-texels 48", "--image-texels: expected a power of two, found 48"),
+        ("wrinkles offsets", "--texels 48", "--texels: expected a power of two, found 48"),
         ("check", "--workers 0", "--workers: expected at least 1, found 0"),
         ("check", "--fps -1", "--fps: expected a positive number, found -1"),
         ("convert-poses", "--fps 0", "--fps: expected a positive number, found 0"),
@@ -71,7 +72,7 @@ def test_one_line_and_nothing_is_written(
 ):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as exit_:
-        main([command, *INPUTS[command], *options.split()])
+        main([*command.split(), *INPUTS[command], *options.split()])
     (line,) = capsys.readouterr().err.splitlines()
     assert exit_.value.code == 1
     assert line.startswith(f"capture4d: {said}")
