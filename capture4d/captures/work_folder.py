@@ -187,7 +187,11 @@ def load_registration(folder: Path) -> RegisteredSequence:
         with ArrayFile(folder / "frames" / f"{frame_id:06d}.npz") as arrays:
             residual.append(arrays["residual_m"])
     path = folder / "vertices.npy"
-    vertices = map_array(path, absent=f"no such file; run the command of '{folder.name}' again")
+    vertices = map_array(
+        path,
+        expected="the vertices of all frames",
+        absent=f"no such file; run the command of '{folder.name}' again",
+    )
     if len(vertices) != len(frame_ids):
         raise InputError(f"expected vertices of {len(frame_ids)} frames, found {len(vertices)}", where=path)
     with reading(path, "npy file"):

@@ -128,21 +128,27 @@ class ArrayFile:
         return Mesh(self[f"{prefix}vertices"], self[f"{prefix}faces"], self.get(f"{prefix}uv"))
 
 
-def map_array(path: str | Path, *, absent: str = "no such file") -> np.ndarray:
+def map_array(path: str | Path, *, expected: str = "an array", absent: str = "no such file") -> np.ndarray:
     """The array of an npy file, read-only, which stays on disk until it is touched.
 
     Args:
+        expected: what it should hold, for the message.
         absent: what to say of a file that is not there.
     Raises:
         InputError: the file is missing or damaged.
     """
     path = Path(path)
     with reading(path, "npy file", absent=absent):
-        with path.open("rb") as file:
-            shape, _, dtype = _header(file)
-            there = path.stat().st_size - file.tell()
-        if not shape or math.prod(shape) * dtype.itemsize != there:
-            raise InputError(f"expected {shape} of {dtype}, {math.prod(shape) * dtype.itemsize} bytes, found {there}")
+        try:
+            with path.open("rb") as file:
+                shape, _, dtype = _header(file)
+                there = path.stat().st_size - file.tell()
+        except (ValueError, EOFError, SyntaxError) as error:
+            raise InputError(f"expected {expected}, found a damaged file ({one_line(error)})") from error
+        needed = math.prod(shape) * dtype.itemsize
+        if not shape or needed != there:
+            found = f"{shape} of {dtype}, {needed} bytes, of which {there} are there"
+            raise InputError(f"expected {expected}, found a damaged file ({found})")
         return np.load(path, mmap_mode="r" if there else None, allow_pickle=False)
 
 

@@ -128,11 +128,11 @@ def write_npz(path: str | Path, **arrays: Any) -> None:
     write_bytes(path, buffer.getvalue())
 
 
-def read_json(path: str | Path) -> dict[str, Any]:
+def read_json(path: str | Path, *, expected: str = "a JSON object") -> dict[str, Any]:
     """Read a JSON object; whatever is wrong with the file is an InputError that names it."""
     path = Path(path)
     with reading(path, "JSON file"):
-        return parse_json(path.read_bytes(), path)
+        return _json_object(path.read_bytes(), expected)
 
 
 def parse_json(data: bytes, path: Path) -> dict[str, Any]:
@@ -154,13 +154,13 @@ def read_json_lines(path: str | Path) -> list[dict[str, Any]]:
     return rows
 
 
-def _json_object(text: str | bytes) -> dict[str, Any]:
+def _json_object(text: str | bytes, expected: str = "a JSON object") -> dict[str, Any]:
     try:
         found = json.loads(text if isinstance(text, str) else text.decode())
     except (ValueError, RecursionError) as error:
         raise InputError(f"not valid JSON ({error})") from None
     if not isinstance(found, dict):
-        raise InputError(f"expected a JSON object, found {type(found).__name__}")
+        raise InputError(f"expected {expected}, found {type(found).__name__}")
     return found
 
 

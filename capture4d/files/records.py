@@ -113,7 +113,7 @@ def save_rig(path: str | Path, rig: Rig) -> None:
 
 
 def load_rig(path: str | Path) -> Rig:
-    found = read_json(path)
+    found = read_json(path, expected="a JSON object with cameras")
     with reading(path, "rig"):
         if "cameras" not in found:
             raise InputError("expected the entry 'cameras', found none")

@@ -142,7 +142,7 @@ def test_a_body_tracked_anew_wants_a_new_registration(write_work, motion, tmp_pa
 
 def test_a_damaged_registration_is_one_line(write_work, motion, tmp_path: Path, quick, capsys) -> None:
     work = write_work(tmp_path / "take", motion(12, 0))
-    for name, said in (("frames/000003.npz", "not a readable npz file"), ("vertices.npy", "bytes, found")):
+    for name, said in (("frames/000003.npz", "not a readable npz file"), ("vertices.npy", "found a damaged file")):
         path = work / "registration" / name
         whole = path.read_bytes()
         path.write_bytes(whole[: len(whole) // 2])
