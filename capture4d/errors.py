@@ -1,10 +1,10 @@
-"""The exception that means "the input is at fault, not the program", and three faults that callers tell apart."""
+"""The exception that means "the input is at fault, not the program", and faults that callers tell apart."""
 
 from copy import copy
 from os import PathLike, fspath
 from typing import Any, TypeVar
 
-__all__ = ["EmptyMeshError", "InputError", "NotFiniteError", "StaleError"]
+__all__ = ["CommandLineError", "EmptyMeshError", "InputError", "NotFiniteError", "StaleError"]
 
 Fault = TypeVar("Fault", bound="InputError")
 
@@ -13,8 +13,9 @@ class InputError(ValueError):
     """Bad data from outside: a file, a frame, an argument.
 
     The message is one line that names the file, frame or argument, says what was expected, and what was found. The
-    command line prints it without a traceback and exits with 1; every other exception is our own bug and keeps its
-    traceback.
+    command line prints it without a traceback and exits with 1. What the system answers about a file that is there (no
+    permission, a full disk) stays an OSError, which it prints likewise; every other exception is our own bug and keeps
+    its traceback.
 
     Attributes:
         reason: the message without the file.
@@ -36,6 +37,10 @@ class InputError(ValueError):
     def __reduce__(self) -> tuple[Any, ...]:
         """Whole again on the other side of a process."""
         return _rebuilt, (type(self), {**self.__dict__})
+
+
+class CommandLineError(InputError):
+    """Something that a command needs was not given."""
 
 
 class EmptyMeshError(InputError):

@@ -1,8 +1,9 @@
 """Every stage as a function, by the name of its command: what `capture4d COMMAND` does, for Python.
 
 Folders are named by paths; CAPTURE and WORK may also be handed over open, as `read_capture` and `open_work` return
-them. Every function resumes what was stopped, refuses to go on with other settings unless told to `overwrite`, and
-returns a `StageResult`. The number of workers never changes a result.
+them. Stages with `overwrite` resume what was stopped, refuse to go on with other settings unless told to, and return a
+`StageResult`. The number of workers never changes a result; it is 1 unless given, and with more, a script has to call
+from under `if __name__ == "__main__":`, for its processes import it.
 """
 
 from __future__ import annotations

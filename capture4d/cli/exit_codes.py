@@ -4,6 +4,7 @@ GOOD = 0
 BAD_INPUT = 1
 """A file, a frame or an argument is wrong; one line says which."""
 BAD_COMMAND_LINE = 2
+"""No such command or option, something missing, or a value that cannot be read as what it should be."""
 BAD_RESULT = 3
 """The work was done and its result is bad, or a limit is broken."""
 INTERRUPTED = 130

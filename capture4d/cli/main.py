@@ -28,7 +28,7 @@ from capture4d.cli.models import Animate, Fit
 from capture4d.cli.stages import Extract, Register, Report, Run, Track
 from capture4d.cli.synthesis import Demo, Scan, Synth, SynthBoard
 from capture4d.cli.wrinkles import Compare, WrinklesApply, WrinklesMaps, WrinklesOffsets, WrinklesTrain
-from capture4d.errors import InputError
+from capture4d.errors import CommandLineError, InputError
 from capture4d.settings import gathered_faults
 from data_synth import config as synth_config
 from registration import config as registration_config
@@ -119,6 +119,8 @@ def _run(arguments: list[str]) -> int:
         code = _dispatch(arguments)
         sys.stdout.flush()
         return code
+    except CommandLineError as error:
+        return _complain(str(error), code=BAD_COMMAND_LINE)
     except InputError as error:
         return _complain(str(error))
     except BrokenPipeError:  # whoever read our output, such as `head`, has seen enough

@@ -10,7 +10,7 @@ from tyro.conf import Positional, arg
 
 from capture4d.cli.exit_codes import GOOD
 from capture4d.cli.options import GradedOptions, StageOptions
-from capture4d.errors import InputError
+from capture4d.errors import CommandLineError
 from capture4d.settings import Number
 from retarget.config import AnimateConfig, FitConfig
 
@@ -33,10 +33,12 @@ class Fit(StageOptions):
         from capture4d import pipeline
 
         if not self.works:
-            raise InputError("WORK: expected at least one work folder, found none")
+            raise CommandLineError("WORK: expected at least one work folder, found none")
         first, *others = self.works
         if self.output is None and others:
-            raise InputError(f"--output: expected a work folder for what {1 + len(others)} takes give, found none")
+            raise CommandLineError(
+                f"--output: expected a work folder for what {1 + len(others)} takes give, found none"
+            )
         folder = (self.output or first) / "retarget"
         result = pipeline.fit(
             self.works, folder, self.config, device=self.device, workers=self.workers, overwrite=self.overwrite

@@ -109,7 +109,8 @@ def run_jobs(
             if isinstance(error, BrokenProcessPool):
                 raise WorkerDied(
                     f"{label}: a worker process was killed, perhaps for want of memory; finished frames are kept, "
-                    "the same command goes on (with fewer --workers if memory is short)"
+                    "the same command goes on (with fewer --workers if memory is short). A script of your own must "
+                    "start its work under `if __name__ == '__main__':`"
                 ) from None
             raise
         finally:

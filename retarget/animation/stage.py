@@ -40,6 +40,9 @@ __all__ = ["Wearer", "run", "run_on_coefficients"]
 SCHEMA = 1
 INSIDE_CHECK_PERCENT = 0.3
 """A frame with more of its vertices inside the body, after all, is flagged."""
+STRETCH_FAIL = 2.5
+"""A frame with edges so much longer than the mean garment's, 99th percentile, has failed: cloth does not stretch like
+that. It is where registration gives up as well (`--quality.stretch-fail`)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,13 +255,16 @@ def _write_frame(shared: _Motion, row: int, frame: AnimatedFrame) -> None:
     stage, removed = shared.stage, frame.removed
     frame_id, distance_deg = int(shared.poses.frame_ids[row]), float(shared.distances_deg[row])
     reasons = []
+    torn = not frame.stretch_p99 <= STRETCH_FAIL
+    if torn:
+        reasons.append(f"edges {frame.stretch_p99:.3g} times as long as the mean garment's > {STRETCH_FAIL:g}")
     if distance_deg > shared.unlike_deg:
         reasons.append(f"pose {distance_deg:.0f} deg from every pose that was learned > {shared.unlike_deg:.0f}")
     if removed.after.inside_percent > INSIDE_CHECK_PERCENT:
         reasons.append(f"inside the body {removed.after.inside_percent:.2f} % > {INSIDE_CHECK_PERCENT:g} %")
     record: dict[str, Any] = {
         "frame_id": frame_id,
-        "verdict": "check" if reasons else "good",
+        "verdict": "failed" if torn else "check" if reasons else "good",
         "reasons": reasons,
         "pose_distance_deg": distance_deg,
         "unlike_deg": shared.unlike_deg,
@@ -284,4 +290,5 @@ def _collect(stage: Stage, frame_ids: Sequence[int]) -> StageResult:
     write_json_lines(stage.path / "metrics.jsonl", records)
     frames = [stage.frame_path(frame_id) for frame_id in frame_ids]
     outputs = [stage.path / "garment.npz", stage.path / "vertices.npy", *frames]
-    return stage.finish(outputs, frames=len(frame_ids))
+    failed = {each["frame_id"]: "; ".join(each["reasons"]) for each in records if each["verdict"] == "failed"}
+    return stage.finish(outputs, frames=len(frame_ids), failed=failed)

@@ -79,7 +79,7 @@ def test_takes_that_do_not_fit_together_are_one_line(
     save_garment(anew / "registration" / "garment.npz", replace(world.garment, skin_weights=weights))
     line = fails(capsys, "fit", *works, anew, "--output", tmp_path / "v", *quick)
     assert "take6: expected the skin weights of" in line
-    assert "--output: expected" in fails(capsys, "fit", *works)
+    assert "--output: expected" in fails(capsys, "fit", *works, code=2)
     assert "found take0, take0" in fails(capsys, "fit", works[0], works[0], "--output", tmp_path / "z")
     assert "run: capture4d run" in fails(capsys, "fit", tmp_path / "nothing")
     line = fails(capsys, "fit", works[0], "--output", tmp_path / "w", "--split.held-out", "take9", *quick)

@@ -156,15 +156,17 @@ def test_poses_that_validated_and_were_learned_from_then_are_no_strangers(model:
     assert read_json(model / "fit.json")["validated_deg"] > 1
 
 
-def test_unlike_poses_are_flagged(model: Path, works, motion, tmp_path: Path) -> None:
+def test_unlike_poses_are_flagged_and_torn_cloth_has_failed(model: Path, works, motion, tmp_path: Path) -> None:
     poses = motion(6, 9)
     twisted = poses.rotations.copy()
     twisted[3:, 1] = twisted[3:, 1] @ np.diag([-1, 1, -1]).astype(np.float32)  # half a turn
     save_poses(tmp_path / "odd.npz", replace(poses, rotations=twisted))
-    assert run(*animate(model, tmp_path / "odd.npz", tmp_path / "odd", "--unlike-deg", "40")) == 0
+    assert run(*animate(model, tmp_path / "odd.npz", tmp_path / "odd", "--unlike-deg", "40")) == 3
     records = load_records(tmp_path / "odd" / "registration")
-    assert [record["verdict"] for record in records[3:]] == ["check"] * 3
-    assert "deg from every pose that was learned" in records[3]["reasons"][0]
+    assert [record["verdict"] for record in records[3:]] == ["failed"] * 3
+    torn, unlike = records[3]["reasons"][:2]
+    assert "times as long as the mean garment's > 2.5" in torn
+    assert "deg from every pose that was learned" in unlike
     assert records[0]["pose_distance_deg"] < 40
 
 
