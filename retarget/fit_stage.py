@@ -93,6 +93,8 @@ def run(
     Raises:
         InputError: a registration is missing, takes do not fit together, or there are too few good frames.
     """
+    if not works:
+        raise InputError("takes: expected at least one work folder, found none")
     works = sorted(works, key=lambda work: work.path.resolve().name)
     names = [work.path.resolve().name for work in works]
     if len(set(names)) != len(names):

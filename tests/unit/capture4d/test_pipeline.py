@@ -86,3 +86,15 @@ def test_every_command_has_a_function():
 def test_a_preset_that_is_not_there_is_one_line(tmp_path: Path):
     with pytest.raises(InputError, match=r"^config: expected one of demo, .*tshirt-train.*, found 'dem'$"):
         pipeline.synth(tmp_path, "dem")
+
+
+def test_a_work_folder_that_was_opened_before_its_stages_ran_is_seen_as_it_is_now(tube_capture: Path, tmp_path: Path):
+    early = open_work(tmp_path)
+    pipeline.extract(tube_capture, early)
+    pipeline.register(tube_capture, early)
+    assert pipeline.report(early).path == tmp_path / "report" / "index.html"
+
+
+def test_no_takes_are_one_line(tmp_path: Path):
+    with pytest.raises(InputError, match="at least one work folder, found none"):
+        pipeline.fit([], tmp_path)

@@ -1,18 +1,18 @@
 """What a lab may hand to each command by mistake: one line, exit code 1, and nothing of what was there is lost.
 
 command     fault                                              tested in
-calibrate   no folder, no images, damaged or resized image,    test_calibration_stage (through the command)
+calibrate   no folder, no images, damaged or resized image,    calibration/test_stage (through the command)
             board not in any image, no such dictionary
             malformed board, cameras that share no view        here
-check-rig   no board, cameras of another rig                   test_calibration_stage (through the command)
+check-rig   no board, cameras of another rig                   calibration/test_stage (through the command)
             rig.json missing or broken, no images              here
-check       no folder, no scans, bad description               test_preflight (through the command)
+check       no folder, no scans, bad description               preflight/test_stage (through the command)
             rig.json or poses broken, another skeleton         here
 track       no capture, bad start, another skeleton, damaged   here
             body, nothing but damaged scans
-            some damaged scans                                 test_body_stage
-extract     no capture, other colours, damaged scans           test_cli (through the command)
-template    neither mesh nor region, faults of the mesh        test_garment_template
+            some damaged scans                                 tracking/test_stage
+extract     no capture, other colours, damaged scans           cli/test_main (through the command)
+template    neither mesh nor region, faults of the mesh        templates/test_garment
             missing, truncated or NaN mesh, no UVs to keep,    here
             another skeleton, damaged body, no such frame
 """
