@@ -88,7 +88,7 @@ def _command(*words: object) -> None:
 
 
 def _run_to_the_end(capture: Path, work: Path, workers: int, options: Sequence[str]) -> None:
-    _command("run", capture, "--output", work, "--workers", workers, *options)
+    _command("run", capture, "--output", work, "--workers", workers, "--max-failed", 100, *options)
 
 
 def _kill_after(files: int, seconds: float, capture: Path, work: Path, workers: int, options: Sequence[str]) -> bool:

@@ -59,7 +59,7 @@ def load_registered(work: WorkFolder | str | Path) -> RegisteredSequence:
     Raises:
         InputError: the folder holds no finished registration.
     """
-    opened = work if isinstance(work, WorkFolder) else open_work(work)
+    opened = work.now() if isinstance(work, WorkFolder) else open_work(work)
     _ = opened.registered_digest
     return opened.registered
 

@@ -436,9 +436,7 @@ def _capture(capture: AnyCapture) -> Capture:
 
 
 def _work(work: AnyWork) -> WorkFolder:
-    """The work folder as it is now: one that was opened before a stage wrote to it is opened anew."""
-    now = open_work(_path(work))
-    return work if isinstance(work, WorkFolder) and work.stages == now.stages else now
+    return work.now() if isinstance(work, WorkFolder) else open_work(work)
 
 
 def _path(work: AnyWork) -> Path:

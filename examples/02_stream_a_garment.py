@@ -29,6 +29,7 @@ def main() -> None:
 
     known = load_garment_model(options.model)
     model, person = known.model, known.person()
+    assert model.garment.skin_weights is not None, "a learned garment is bound to a body"
     regressor = known.best
     controls, answers = ControlStream(regressor.layout), regressor.stream()
     poses = load_poses(options.poses)

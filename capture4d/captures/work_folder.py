@@ -58,6 +58,11 @@ class WorkFolder:
         """What travels to another process: not what was read, which is read there if it is needed."""
         return {"path": self.path, "stages": self.stages}
 
+    def now(self) -> WorkFolder:
+        """The folder as it is now: itself, unless a stage has written to it since."""
+        opened = open_work(self.path)
+        return self if self.stages == opened.stages else opened
+
     @property
     def registered_digest(self) -> str:
         """The digest of registration/, whichever stage made it.
