@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from capture4d.types import Mesh
+from capture4d.types import Mesh, Rig
 
 
 def tube_faces(around: int, along: int) -> np.ndarray:
@@ -33,3 +33,17 @@ def plane(size: float = 1.0, cells: int = 4, height: float = 0.0) -> Mesh:
     a = i * (cells + 1) + j
     b, c, d = a + 1, a + cells + 1, a + cells + 2
     return Mesh(vertices, np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)]).astype(np.int32))
+
+
+def ring(cameras: int = 12, radius: float = 2.5) -> Rig:
+    """Cameras around the origin at shoulder height that look at it; a subject at the middle fills their images."""
+    angle = 2 * np.pi * np.arange(cameras) / cameras
+    T = np.tile(np.eye(4), (cameras, 1, 1))
+    T[:, 0, :3] = np.stack([np.cos(angle), 0 * angle, -np.sin(angle)], 1)
+    T[:, 1, :3] = (0, -1, 0)
+    T[:, 2, :3] = np.stack([-np.sin(angle), 0 * angle, -np.cos(angle)], 1)
+    T[:, :3, 3] = (0, 1.2, radius)
+    K = np.array([[600.0, 0, 256], [0, 600, 256], [0, 0, 1]])
+    sizes = np.full((cameras, 2), 513, np.int32)
+    names = tuple(f"cam{index:02d}" for index in range(cameras))
+    return Rig(names, np.tile(K, (cameras, 1, 1)), np.zeros((cameras, 5)), T, sizes)

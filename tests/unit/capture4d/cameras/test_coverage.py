@@ -7,6 +7,7 @@ import pytest
 
 from capture4d.cameras.coverage import best_share, camera_counts, rig_middle
 from capture4d.types import Rig
+from tests.shapes import ring
 
 
 def test_cameras_count_what_lies_in_their_images():
@@ -20,20 +21,6 @@ def test_cameras_count_what_lies_in_their_images():
     )
     points = np.array([[0.0, 0, 1], [0.49, 0, 1], [0.6, 0, 1], [0, 0, -1]])
     np.testing.assert_array_equal(camera_counts(rig, points), [1, 1, 0, 0])
-
-
-def ring(cameras: int = 12, radius: float = 2.5) -> Rig:
-    """Cameras around the origin at shoulder height that look at it; a subject at the middle fills their images."""
-    angle = 2 * np.pi * np.arange(cameras) / cameras
-    T = np.tile(np.eye(4), (cameras, 1, 1))
-    T[:, 0, :3] = np.stack([np.cos(angle), 0 * angle, -np.sin(angle)], 1)
-    T[:, 1, :3] = (0, -1, 0)
-    T[:, 2, :3] = np.stack([-np.sin(angle), 0 * angle, -np.cos(angle)], 1)
-    T[:, :3, 3] = (0, 1.2, radius)
-    K = np.array([[600.0, 0, 256], [0, 600, 256], [0, 0, 1]])
-    sizes = np.full((cameras, 2), 513, np.int32)
-    names = tuple(f"cam{index:02d}" for index in range(cameras))
-    return Rig(names, np.tile(K, (cameras, 1, 1)), np.zeros((cameras, 5)), T, sizes)
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0, 0), (0.3, 0, -1.1)])

@@ -37,6 +37,7 @@ from capture4d.preflight.survey import find_units
 from capture4d.preflight.take_folder import time_stamp
 from capture4d.preflight.verdict import judge
 from capture4d.types import Mesh, Rig, Scan
+from tests.shapes import ring
 
 BLUE, YELLOW, GREY = (47, 98, 201), (255, 196, 0), (150, 152, 156)
 PAINTS = Paints(BLUE, (YELLOW,))
@@ -155,20 +156,6 @@ def test_a_shift_is_measured_across_the_surface():
     assert surface_shift(ball, ball) == pytest.approx(0.0, abs=1e-6)
     grown = ball.with_vertices(ball.vertices * np.float32(1.02))
     assert surface_shift(ball, grown) == pytest.approx(0.006, rel=0.05)
-
-
-def ring(cameras: int = 12, radius: float = 2.5) -> Rig:
-    """Cameras around the origin at shoulder height that look at it; a subject at the middle fills their images."""
-    angle = 2 * np.pi * np.arange(cameras) / cameras
-    T = np.tile(np.eye(4), (cameras, 1, 1))
-    T[:, 0, :3] = np.stack([np.cos(angle), 0 * angle, -np.sin(angle)], 1)
-    T[:, 1, :3] = (0, -1, 0)
-    T[:, 2, :3] = np.stack([-np.sin(angle), 0 * angle, -np.cos(angle)], 1)
-    T[:, :3, 3] = (0, 1.2, radius)
-    K = np.array([[600.0, 0, 256], [0, 600, 256], [0, 0, 1]])
-    sizes = np.full((cameras, 2), 513, np.int32)
-    names = tuple(f"cam{index:02d}" for index in range(cameras))
-    return Rig(names, np.tile(K, (cameras, 1, 1)), np.zeros((cameras, 5)), T, sizes)
 
 
 @pytest.mark.parametrize(("distance", "wrong"), [(0.0, False), (0.5, False), (2.0, True), (4.0, True)])
