@@ -16,10 +16,10 @@ from jaxtyping import Float
 from benchmarks.plain_takes import PlainTake
 from capture4d.captures.placement import Placement, place_rig
 from capture4d.files.atomic import write_bytes, write_json
-from capture4d.files.meshes import write_mesh
-from capture4d.files.ply import ply_bytes
 from capture4d.files.records import save_body, save_poses, save_rig
 from capture4d.geometry.mesh import vertex_normals
+from capture4d.mesh_files.meshes import write_mesh
+from capture4d.mesh_files.ply import ply_bytes
 from capture4d.types import Mesh, Scan
 
 __all__ = [

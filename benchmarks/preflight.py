@@ -23,7 +23,7 @@ from benchmarks import damaged_takes as damage
 from benchmarks.metric import Metric
 from benchmarks.plain_takes import COARSE_SCANNER, PlainTake, PlainTakeConfig, plain_take
 from capture4d.body.anny import load_anny
-from capture4d.files.meshes import write_mesh
+from capture4d.mesh_files.meshes import write_mesh
 from capture4d.preflight.check import check_take
 from capture4d.preflight.findings import Code
 from capture4d.preflight.fix import write_fixed

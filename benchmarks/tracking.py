@@ -37,15 +37,15 @@ from benchmarks.dressed_body import covered_vertices, dress_body, sample_scan
 from benchmarks.metric import Metric
 from capture4d import pipeline
 from capture4d.body.anny import load_anny
-from capture4d.body.bvh import read_bvh
-from capture4d.body.motion_files import read_motion, write_motion
-from capture4d.body.motion_retarget import retarget
 from capture4d.body.skinning import PosedBody, ShapedBody, pose_frame, with_pose, with_shape
 from capture4d.captures.capture import Capture, read_capture, read_scan, write_capture_description, write_scan
 from capture4d.captures.work_folder import load_tracking
 from capture4d.files.arrays import ArrayFile
 from capture4d.files.atomic import read_json
 from capture4d.files.records import load_poses, save_body, save_poses
+from capture4d.motions.bvh import read_bvh
+from capture4d.motions.motion_files import read_motion, write_motion
+from capture4d.motions.retargeting import retarget
 from capture4d.tracking.config import TrackingConfig
 from capture4d.tracking.sequence import Followed, Tracker
 from capture4d.tracking.stage import run as track

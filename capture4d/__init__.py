@@ -13,8 +13,6 @@ from capture4d.own_packages import claim_names
 if TYPE_CHECKING:
     from capture4d import pipeline as pipeline
     from capture4d.body.anny import load_anny as load_anny
-    from capture4d.body.motion_files import read_motion as read_motion
-    from capture4d.body.motion_files import write_motion as write_motion
     from capture4d.body.skinning import pose_frame as pose_frame
     from capture4d.body.skinning import skin as skin
     from capture4d.body.skinning import unskin as unskin
@@ -29,9 +27,6 @@ if TYPE_CHECKING:
     from capture4d.captures.work_folder import open_work as open_work
     from capture4d.errors import InputError as InputError
     from capture4d.errors import StaleError as StaleError
-    from capture4d.files.meshes import read_coloured_mesh as read_coloured_mesh
-    from capture4d.files.meshes import read_mesh as read_mesh
-    from capture4d.files.meshes import write_mesh as write_mesh
     from capture4d.files.records import load_body as load_body
     from capture4d.files.records import load_garment as load_garment
     from capture4d.files.records import load_poses as load_poses
@@ -40,6 +35,11 @@ if TYPE_CHECKING:
     from capture4d.files.records import save_garment as save_garment
     from capture4d.files.records import save_poses as save_poses
     from capture4d.files.records import save_rig as save_rig
+    from capture4d.mesh_files.meshes import read_coloured_mesh as read_coloured_mesh
+    from capture4d.mesh_files.meshes import read_mesh as read_mesh
+    from capture4d.mesh_files.meshes import write_mesh as write_mesh
+    from capture4d.motions.motion_files import read_motion as read_motion
+    from capture4d.motions.motion_files import write_motion as write_motion
     from capture4d.one_shot import load_garment_model as load_garment_model
     from capture4d.one_shot import load_registered as load_registered
     from capture4d.one_shot import register_mesh as register_mesh
@@ -59,12 +59,12 @@ claim_names()
 
 _HOMES = {
     "capture4d.body.anny": "load_anny",
-    "capture4d.body.motion_files": "read_motion write_motion",
+    "capture4d.motions.motion_files": "read_motion write_motion",
     "capture4d.body.skinning": "pose_frame skin unskin with_pose with_shape",
     "capture4d.captures.capture": "Capture read_capture read_scan write_capture_description write_scan",
     "capture4d.captures.work_folder": "WorkFolder open_work",
     "capture4d.errors": "InputError StaleError",
-    "capture4d.files.meshes": "read_coloured_mesh read_mesh write_mesh",
+    "capture4d.mesh_files.meshes": "read_coloured_mesh read_mesh write_mesh",
     "capture4d.files.records": "load_body load_garment load_poses load_rig save_body save_garment save_poses save_rig",
     "capture4d.one_shot": "load_garment_model load_registered register_mesh wrinkle_map",
     "capture4d.runs.stage": "StageResult",

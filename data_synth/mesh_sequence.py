@@ -12,7 +12,7 @@ import numpy as np
 from capture4d.errors import InputError
 from capture4d.files.arrays import ArrayFile
 from capture4d.files.atomic import file_digest
-from capture4d.files.meshes import MESH_SUFFIXES, read_mesh
+from capture4d.mesh_files.meshes import MESH_SUFFIXES, read_mesh
 from capture4d.types import Mesh
 
 __all__ = ["MeshSequence", "open_sequence"]

@@ -15,10 +15,10 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation, Slerp
 
-from capture4d.body.bvh import read_bvh
-from capture4d.body.motion_retarget import pose_sequence, retarget
 from capture4d.body.skinning import ShapedBody, with_pose
 from capture4d.errors import InputError
+from capture4d.motions.bvh import read_bvh
+from capture4d.motions.retargeting import pose_sequence, retarget
 from capture4d.types import PoseSequence
 from data_synth.config import ClipName, MotionConfig
 

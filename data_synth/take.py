@@ -13,8 +13,8 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from capture4d.body.anny import load_anny
-from capture4d.body.motion_retarget import pose_sequence
 from capture4d.body.skinning import PosedBody, ShapedBody, pose_frame, with_shape
+from capture4d.motions.retargeting import pose_sequence
 from capture4d.types import Mesh, PoseSequence, Rig
 from data_synth.cloth.patterns import PanelMesh, Pattern, grade, mesh_pattern, tshirt_pattern
 from data_synth.cloth.simulation import approach_poses, dress, simulate

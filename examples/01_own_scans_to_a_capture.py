@@ -16,9 +16,9 @@ from pathlib import Path
 
 from capture4d.captures.capture import Capture, write_capture_description
 from capture4d.colours.spaces import parse_colour
-from capture4d.files.meshes import MESH_SUFFIXES, read_mesh
 from capture4d.files.records import save_garment
 from capture4d.geometry.mesh import boundary_loops
+from capture4d.mesh_files.meshes import MESH_SUFFIXES, read_mesh
 from capture4d.types import Garment
 
 

@@ -13,8 +13,8 @@ import argparse
 from pathlib import Path
 
 from capture4d.body.skinning import skin, with_pose
-from capture4d.files.meshes import write_mesh
 from capture4d.files.records import load_poses
+from capture4d.mesh_files.meshes import write_mesh
 from retarget.animation.garment_model import load_garment_model
 from retarget.regression.controls import ControlStream
 from retarget.shapes.blendshapes import reconstruct

@@ -17,8 +17,8 @@ from jaxtyping import Float32, Float64
 from capture4d.colours.spaces import parse_colour
 from capture4d.errors import InputError
 from capture4d.files.atomic import nan_to_none, write_json
-from capture4d.files.meshes import MESH_SUFFIXES, read_mesh, write_mesh
 from capture4d.geometry.mesh import boundary_loops, submesh
+from capture4d.mesh_files.meshes import MESH_SUFFIXES, read_mesh, write_mesh
 from capture4d.types import Garment, GarmentScan, Mesh
 from capture4d.units import METRES, Units
 from registration.alignment import Similarity, align

@@ -1,1 +1,1 @@
-"""A person as a skinned mesh: shape, pose, skin; where bodies and motions come from."""
+"""A person as a skinned mesh: shape, pose, skin; where bodies come from."""

@@ -25,9 +25,9 @@ from capture4d.cameras.colmap import read_model, write_model
 from capture4d.errors import InputError
 from capture4d.files.arrays import ArrayFile
 from capture4d.files.atomic import read_json, write_json, write_npz
+from capture4d.files.pictures import holds_pixels
 from capture4d.files.reading import reading
 from capture4d.files.records import load_rig, save_rig
-from capture4d.files.textures import holds_pixels
 from capture4d.runs.file_stage import open_file_stage
 from capture4d.runs.stage import StageResult
 from capture4d.runs.workers import run_jobs

@@ -26,7 +26,6 @@ from capture4d.body.anny import load_anny
 from capture4d.colours.spaces import Colour, format_colour, parse_colour
 from capture4d.errors import InputError
 from capture4d.files.atomic import content_digest, file_digest, parse_json, write_json
-from capture4d.files.meshes import MESH_SUFFIXES, read_coloured_mesh, read_mesh, write_mesh
 from capture4d.files.reading import one_line, shortened
 from capture4d.files.records import (
     load_body,
@@ -35,6 +34,7 @@ from capture4d.files.records import (
     load_rig,
 )
 from capture4d.geometry.mesh import boundary_loops
+from capture4d.mesh_files.meshes import MESH_SUFFIXES, read_coloured_mesh, read_mesh, write_mesh
 from capture4d.types import Body, Garment, PoseSequence, Rig, Scan
 from capture4d.units import METRES, Units
 

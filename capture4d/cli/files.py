@@ -134,8 +134,8 @@ class ConvertPoses:
 
     def __call__(self) -> int:
         from capture4d.body.anny import load_anny
-        from capture4d.body.motion_files import read_motion, write_motion
         from capture4d.files.records import load_body
+        from capture4d.motions.motion_files import read_motion, write_motion
 
         body = load_body(self.body) if self.body else load_anny()
         poses = read_motion(self.input, body, fps=self.fps)

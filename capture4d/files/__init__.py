@@ -1,1 +1,1 @@
-"""One value, one file: meshes, arrays, records; whole or not there at all, and errors name the file and the line."""
+"""One value, one file: arrays, records, pictures; whole or not there at all, and errors name the file and the line."""

@@ -16,7 +16,7 @@ import numpy as np
 from capture4d.cameras.coverage import camera_counts
 from capture4d.captures.placement import Placement, place, place_rig
 from capture4d.colours.labels import OTHER, classify_colours
-from capture4d.files.polygons import MeshFile
+from capture4d.mesh_files.polygons import MeshFile
 from capture4d.preflight.facts import BadFrame, Paints
 from capture4d.preflight.findings import Verdict
 from capture4d.preflight.mannequin import sample_surface

@@ -21,8 +21,8 @@ from capture4d.captures.take_colours import template_loops
 from capture4d.colours.spaces import format_colour, parse_colour
 from capture4d.errors import InputError
 from capture4d.files.atomic import write_json
-from capture4d.files.meshes import MESH_SUFFIXES, read_mesh, write_mesh
 from capture4d.files.records import load_poses, save_poses, save_rig
+from capture4d.mesh_files.meshes import MESH_SUFFIXES, read_mesh, write_mesh
 from capture4d.preflight.check import Checked
 from capture4d.preflight.facts import BadFrame
 from capture4d.preflight.statistics import outwardness

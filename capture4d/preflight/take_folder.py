@@ -19,10 +19,10 @@ from capture4d.body.skinning import ShapedBody, pose_frame, with_shape
 from capture4d.colours.spaces import parse_colour
 from capture4d.errors import EmptyMeshError, InputError, NotFiniteError
 from capture4d.files.atomic import read_json
-from capture4d.files.meshes import MESH_SUFFIXES, read_coloured_mesh
-from capture4d.files.polygons import MeshFile
 from capture4d.files.records import load_body, load_poses, load_rig
 from capture4d.geometry.mesh import doubled_area_vectors
+from capture4d.mesh_files.meshes import MESH_SUFFIXES, read_coloured_mesh
+from capture4d.mesh_files.polygons import MeshFile
 from capture4d.preflight.facts import BadFrame, Paints, TakeFacts
 from capture4d.types import PoseSequence, Rig
 from capture4d.units import METRES

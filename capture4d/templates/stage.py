@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from capture4d.body.anny import load_anny
-from capture4d.body.motion_files import read_motion
 from capture4d.body.skinning import PosedBody, pose_frame, with_pose, with_shape
 from capture4d.errors import InputError
 from capture4d.files.atomic import file_digest
-from capture4d.files.meshes import read_mesh
 from capture4d.files.records import load_body, save_garment
+from capture4d.mesh_files.meshes import read_mesh
+from capture4d.motions.motion_files import read_motion
 from capture4d.runs.stage import StageResult
 from capture4d.templates.body_regions import body_region
 from capture4d.templates.config import TEMPLATE, TemplateConfig

@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 
 from capture4d.body.anny import load_anny
-from capture4d.body.motion_files import read_motion
 from capture4d.body.posed_surface import BodyState
 from capture4d.captures.capture import Capture, read_scan, scan_path
 from capture4d.captures.take_colours import KnownColours, take_colours
@@ -37,6 +36,7 @@ from capture4d.files.atomic import (
     write_npz,
 )
 from capture4d.files.records import load_body, save_body, save_poses
+from capture4d.motions.motion_files import read_motion
 from capture4d.runs.stage import Stage, StageResult, open_stage
 from capture4d.runs.workers import progress, run_jobs
 from capture4d.tracking.config import SequenceConfig, TrackingConfig

@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from capture4d.body.motion_files import read_motion, resample
 from capture4d.body.skinning import ShapedBody
 from capture4d.captures.work_folder import ANIMATE, VERDICTS, stack_vertices
 from capture4d.errors import InputError
 from capture4d.files.arrays import map_array
 from capture4d.files.atomic import file_digest, read_json, write_json, write_json_lines, write_npy, write_npz
 from capture4d.files.records import load_body, load_poses, save_body, save_garment, save_poses
+from capture4d.motions.motion_files import read_motion, resample
 from capture4d.runs.stage import Stage, StageResult, open_stage
 from capture4d.runs.workers import run_jobs
 from capture4d.types import PoseSequence

@@ -19,8 +19,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from capture4d.body.bvh import Bvh, format_bvh
-from capture4d.body.motion_files import read_motion, write_amass, write_bvh
 from capture4d.body.smpl import read_smpl
 from capture4d.cameras.colmap import read_model, write_model
 from capture4d.captures.capture import Capture, read_capture, write_capture_description
@@ -36,7 +34,6 @@ from capture4d.captures.truth import (
 from capture4d.errors import InputError
 from capture4d.files.arrays import map_array
 from capture4d.files.atomic import read_json, read_json_lines, write_json, write_json_lines, write_npy, write_npz
-from capture4d.files.meshes import read_coloured_mesh, write_mesh
 from capture4d.files.records import (
     load_body,
     load_garment,
@@ -48,6 +45,9 @@ from capture4d.files.records import (
     save_rig,
 )
 from capture4d.files.tensors import read_tensors, write_tensors
+from capture4d.mesh_files.meshes import read_coloured_mesh, write_mesh
+from capture4d.motions.bvh import Bvh, format_bvh
+from capture4d.motions.motion_files import read_motion, write_amass, write_bvh
 from capture4d.types import BlendshapeModel, Body, Garment, GarmentScan, Mesh, PoseSequence, Rig
 from data_synth.mesh_sequence import open_sequence
 from retarget.shapes.files import load_blendshapes, save_blendshapes
@@ -265,8 +265,8 @@ BY_NAME = {kind.name: kind for kind in KINDS}
 
 def smpl_body() -> tuple[Body, PoseSequence]:
     """SMPL's joints, where retargeting looks for them."""
-    from capture4d.body.motion_retarget import SMPL_TREE
     from capture4d.body.smpl import SMPL_JOINTS
+    from capture4d.motions.retargeting import SMPL_TREE
 
     parents = [*(parent for parent, _ in SMPL_TREE.values()), 20, 21]
     offsets = [*(offset for _, offset in SMPL_TREE.values()), (0.08, 0, 0), (-0.08, 0, 0)]

@@ -12,8 +12,8 @@ from hypothesis.extra import numpy as hnp
 from PIL import Image
 
 from capture4d.errors import InputError
-from capture4d.files.meshes import read_coloured_mesh, read_mesh, write_mesh
 from capture4d.geometry.mesh import boundary_edges, boundary_loops, unique_edges
+from capture4d.mesh_files.meshes import read_coloured_mesh, read_mesh, write_mesh
 from capture4d.types import Mesh
 
 FLOATS = st.floats(-1e6, 1e6, width=32, allow_subnormal=False)

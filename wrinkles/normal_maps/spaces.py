@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, UInt8, UInt16
 
 from capture4d.errors import InputError
-from capture4d.files.textures import holds_pixels
+from capture4d.files.pictures import holds_pixels
 
 __all__ = [
     "decode_png",

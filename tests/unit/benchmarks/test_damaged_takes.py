@@ -11,7 +11,7 @@ import pytest
 from benchmarks import damaged_takes as damage
 from benchmarks.plain_takes import PlainTake
 from capture4d.errors import EmptyMeshError, InputError, NotFiniteError
-from capture4d.files.meshes import read_mesh
+from capture4d.mesh_files.meshes import read_mesh
 from capture4d.types import Mesh, Scan
 
 

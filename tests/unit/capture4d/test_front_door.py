@@ -12,7 +12,7 @@ import trimesh
 import capture4d
 from capture4d import one_shot
 from capture4d.errors import InputError
-from capture4d.files.polygons import MeshFile
+from capture4d.mesh_files.polygons import MeshFile
 from capture4d.types import Mesh
 
 ROOT = Path(__file__).parents[3]

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from capture4d.body.bvh import read_bvh
-from capture4d.body.motion_retarget import retarget
 from capture4d.body.skinning import ShapedBody, pose_frame
 from capture4d.errors import InputError
+from capture4d.motions.bvh import read_bvh
+from capture4d.motions.retargeting import retarget
 from data_synth.config import MotionConfig
 from data_synth.motions import SPINE_LIMITS, arms_enter_trunk, make_motion
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from capture4d.files.meshes import read_mesh, write_mesh
 from capture4d.files.records import load_garment, save_poses
+from capture4d.mesh_files.meshes import read_mesh, write_mesh
 from tests.command_line import run
 
 # A garment that can be learned is what retarget's tests have.

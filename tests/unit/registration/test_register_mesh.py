@@ -10,7 +10,7 @@ import pytest
 
 from capture4d.errors import InputError
 from capture4d.extraction.garment import painted_border
-from capture4d.files.meshes import read_mesh, write_mesh
+from capture4d.mesh_files.meshes import read_mesh, write_mesh
 from capture4d.types import Mesh
 from registration.config import SOFT, MeshRegistrationConfig, QualityConfig, Schedule
 from registration.register_mesh import guess_units, register_mesh, run

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from capture4d.body.motion_retarget import SMPL_TREE
 from capture4d.body.skinning import skin, unskin, with_pose, with_shape
 from capture4d.body.smpl import read_smpl
 from capture4d.errors import InputError
 from capture4d.files.atomic import write_npz
+from capture4d.motions.retargeting import SMPL_TREE
 from capture4d.types import Body, Mesh
 
 

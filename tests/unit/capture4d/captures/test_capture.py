@@ -30,8 +30,8 @@ from capture4d.captures.truth import (
 )
 from capture4d.colours.spaces import format_colour, parse_colour
 from capture4d.errors import InputError
-from capture4d.files.meshes import write_mesh
 from capture4d.files.records import load_body, load_garment, load_rig, save_body, save_garment, save_poses, save_rig
+from capture4d.mesh_files.meshes import write_mesh
 from capture4d.types import Body, Garment, Mesh, PoseSequence, Rig, Scan
 
 FRAMES = (11, 12, 15)

@@ -28,13 +28,13 @@ import pytest
 
 from benchmarks.simulated_views import calibration_rig, simulate_views
 from capture4d.body.anny import load_anny
-from capture4d.body.motion_retarget import SMPL_TREE
 from capture4d.body.skinning import with_shape
 from capture4d.calibration.stage import DETECTOR
 from capture4d.cameras.board import parse_board
 from capture4d.files.atomic import write_bytes, write_npz
-from capture4d.files.meshes import write_mesh
 from capture4d.files.records import save_body, save_poses, save_rig
+from capture4d.mesh_files.meshes import write_mesh
+from capture4d.motions.retargeting import SMPL_TREE
 from capture4d.templates.body_regions import body_region
 from capture4d.types import Mesh, PoseSequence
 from data_synth.board.views import wave_board

@@ -17,9 +17,9 @@ from capture4d.captures.garment_scans import load_garment_scan
 from capture4d.cli.main import COMMANDS, main
 from capture4d.errors import InputError
 from capture4d.files.atomic import write_bytes, write_json
-from capture4d.files.meshes import read_mesh, write_mesh
-from capture4d.files.ply import ply_bytes
 from capture4d.files.records import load_garment, save_garment, save_poses
+from capture4d.mesh_files.meshes import read_mesh, write_mesh
+from capture4d.mesh_files.ply import ply_bytes
 from capture4d.runs.stage import StageResult
 from capture4d.types import Mesh, PoseSequence
 from data_synth.config import SynthConfig

@@ -17,8 +17,8 @@ from capture4d.colours.learning import ColoursNotSeparableError, fit_light, lear
 from capture4d.colours.spaces import encode_colours, linear_colours
 from capture4d.extraction.garment import extract_garment
 from capture4d.extraction.stage import ExtractionSettings, run
-from capture4d.files.meshes import read_coloured_mesh
 from capture4d.geometry.mesh import vertex_normals
+from capture4d.mesh_files.meshes import read_coloured_mesh
 from capture4d.tracking.config import SamplingConfig
 from capture4d.tracking.scan_points import ScanPoints, scan_points
 from capture4d.types import Mesh, Scan

@@ -13,15 +13,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from capture4d.body.anny import load_anny
-from capture4d.body.motion_retarget import pose_sequence
 from capture4d.body.skinning import pose_frame, with_shape
 from capture4d.captures.placement import Placement, place, place_rig
 from capture4d.cli.main import main
 from capture4d.colours.spaces import to_lab
 from capture4d.files.atomic import write_json
-from capture4d.files.meshes import read_coloured_mesh, read_mesh, write_mesh
 from capture4d.files.records import load_poses, save_body, save_poses
-from capture4d.files.textures import texture_colours
+from capture4d.mesh_files.meshes import read_coloured_mesh, read_mesh, write_mesh
+from capture4d.mesh_files.textures import texture_colours
+from capture4d.motions.retargeting import pose_sequence
 from capture4d.preflight.facts import BadFrame, Paints, TakeFacts
 from capture4d.preflight.findings import ADVICE, CODES
 from capture4d.preflight.mannequin import upright

@@ -13,10 +13,10 @@ from capture4d.body.anny import load_anny
 from capture4d.body.skinning import PosedBody, ShapedBody, pose_frame, with_pose, with_shape
 from capture4d.cli.main import main
 from capture4d.errors import InputError
-from capture4d.files.meshes import write_mesh
 from capture4d.files.records import load_garment, save_body, save_poses
 from capture4d.geometry.mesh import boundary_loops, unique_edges
 from capture4d.geometry.uv_atlas import check_uv, fresh_uv
+from capture4d.mesh_files.meshes import write_mesh
 from capture4d.templates.body_regions import body_region
 from capture4d.templates.config import Region, TemplateConfig
 from capture4d.templates.garment import make_template, weld

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from capture4d.body.anny import load_anny
-from capture4d.body.motion_retarget import SMPL_TREE
+from capture4d.motions.retargeting import SMPL_TREE
 from capture4d.tracking.limbs import guessed_limbs, unseen_limbs
 
 SKELETONS = (load_anny().joint_names, tuple(SMPL_TREE))

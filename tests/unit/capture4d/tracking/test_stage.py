@@ -12,7 +12,6 @@ from scipy.spatial import KDTree
 
 from benchmarks.dressed_body import dress_body
 from capture4d.body.anny import load_anny
-from capture4d.body.motion_retarget import pose_sequence
 from capture4d.body.posed_surface import BodyState
 from capture4d.body.skinning import pose_frame, with_shape
 from capture4d.captures.capture import Capture, read_capture, write_capture_description, write_scan
@@ -21,6 +20,7 @@ from capture4d.errors import InputError
 from capture4d.files.atomic import read_json
 from capture4d.files.records import save_body, save_poses
 from capture4d.geometry.mesh import submesh
+from capture4d.motions.retargeting import pose_sequence
 from capture4d.tracking import stage as body_stage
 from capture4d.tracking.config import TrackingConfig
 from capture4d.tracking.sequence import Followed, Quality

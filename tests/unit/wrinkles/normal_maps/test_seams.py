@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from capture4d.errors import InputError
-from capture4d.files.textures import holds_pixels
+from capture4d.files.pictures import holds_pixels
 from capture4d.types import Garment, Mesh
 from wrinkles.normal_maps.config import MapConfig
 from wrinkles.normal_maps.display import fill_holes

@@ -12,12 +12,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from capture4d.body.anny import load_anny
-from capture4d.body.bvh import Bvh, format_bvh, read_bvh
-from capture4d.body.motion_files import read_motion, resample, write_motion
-from capture4d.body.motion_retarget import SMPL_TREE, retarget
 from capture4d.body.skinning import pose_frame, with_shape
 from capture4d.body.smpl import SMPL_JOINTS
 from capture4d.errors import InputError
+from capture4d.motions.bvh import Bvh, format_bvh, read_bvh
+from capture4d.motions.motion_files import read_motion, resample, write_motion
+from capture4d.motions.retargeting import SMPL_TREE, retarget
 from capture4d.types import Body, Mesh, PoseSequence
 
 

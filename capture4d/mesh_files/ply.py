@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from capture4d.errors import InputError
-from capture4d.files.polygons import MeshFile, colour_bytes, polygon_corners, polygon_mesh
+from capture4d.mesh_files.polygons import MeshFile, colour_bytes, polygon_corners, polygon_mesh
 from capture4d.types import Mesh
 
 __all__ = ["ply_bytes", "read_ply"]
@@ -65,7 +65,7 @@ class _Element:
 
 
 def read_ply(path: Path) -> MeshFile:
-    """Read a PLY file; `capture4d.files.meshes.read_mesh` is the way in.
+    """Read a PLY file; `capture4d.mesh_files.meshes.read_mesh` is the way in.
 
     Raises:
         InputError: the file is damaged or cut off; the message does not name it.

@@ -14,9 +14,9 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from capture4d.body.bvh import Bvh
 from capture4d.body.skinning import ShapedBody, with_pose
 from capture4d.errors import InputError
+from capture4d.motions.bvh import Bvh
 from capture4d.types import PoseSequence
 
 __all__ = ["SMPL_TREE", "as_smpl", "pose_sequence", "retarget"]

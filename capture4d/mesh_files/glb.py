@@ -19,9 +19,10 @@ import numpy as np
 from jaxtyping import Float32, Float64, Integer, UInt8
 
 from capture4d.errors import InputError
-from capture4d.files.polygons import MeshFile
+from capture4d.files.pictures import picture_pixels
 from capture4d.files.reading import companion
-from capture4d.files.textures import texture_colours, texture_pixels
+from capture4d.mesh_files.polygons import MeshFile
+from capture4d.mesh_files.textures import texture_colours
 from capture4d.types import Mesh
 
 __all__ = ["glb_bytes", "read_coloured_glb", "read_glb"]
@@ -50,7 +51,7 @@ class _Primitive:
 
 
 def read_glb(path: Path) -> MeshFile:
-    """Read a GLB file; `capture4d.files.meshes.read_mesh` is the way in.
+    """Read a GLB file; `capture4d.mesh_files.meshes.read_mesh` is the way in.
 
     Raises:
         InputError: the file is damaged; the message need not name it.
@@ -377,7 +378,7 @@ def _textured(document: _Document, primitive: _Primitive) -> UInt8[np.ndarray, "
     if which or mesh.uv is None:
         mesh = Mesh(mesh.vertices, mesh.faces, _coordinates(document, primitive.attributes, which, mesh.faces))
     image = document.entry("textures", texture.get("index")).get("source")
-    return texture_colours(mesh, texture_pixels(document.bytes_of("images", image)))
+    return texture_colours(mesh, picture_pixels(document.bytes_of("images", image)))
 
 
 def _base_colour(document: _Document, primitive: _Primitive) -> UInt8[np.ndarray, "verts 3"]:

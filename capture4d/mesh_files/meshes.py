@@ -15,12 +15,13 @@ from jaxtyping import Int32, UInt8
 
 from capture4d.errors import EmptyMeshError, InputError
 from capture4d.files.atomic import write_bytes
-from capture4d.files.glb import glb_bytes, read_coloured_glb, read_glb
-from capture4d.files.obj import obj_bytes, read_obj
-from capture4d.files.ply import ply_bytes, read_ply
-from capture4d.files.polygons import MeshFile
+from capture4d.files.pictures import read_picture
 from capture4d.files.reading import reading
-from capture4d.files.textures import named_texture, read_texture, texture_colours
+from capture4d.mesh_files.glb import glb_bytes, read_coloured_glb, read_glb
+from capture4d.mesh_files.obj import obj_bytes, read_obj
+from capture4d.mesh_files.ply import ply_bytes, read_ply
+from capture4d.mesh_files.polygons import MeshFile
+from capture4d.mesh_files.textures import named_texture, texture_colours
 from capture4d.types import Mesh
 
 __all__ = ["MESH_SUFFIXES", "MeshFile", "read_coloured_mesh", "read_mesh", "write_mesh"]
@@ -58,7 +59,7 @@ def read_coloured_mesh(path: str | Path) -> MeshFile:
         picture = named_texture(path)
         if picture is None or found.mesh.uv is None:
             return found
-        return replace(found, colours=texture_colours(found.mesh, read_texture(picture)))
+        return replace(found, colours=texture_colours(found.mesh, read_picture(picture)))
 
 
 def _read(path: Path) -> MeshFile:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from capture4d.errors import InputError, NotFiniteError
-from capture4d.files.polygons import MeshFile, colour_bytes, polygon_corners, polygon_mesh
+from capture4d.mesh_files.polygons import MeshFile, colour_bytes, polygon_corners, polygon_mesh
 from capture4d.types import Mesh
 
 __all__ = ["obj_bytes", "read_obj"]
@@ -21,7 +21,7 @@ _MOST = 2**31 - 1
 
 
 def read_obj(path: Path) -> MeshFile:
-    """Read an OBJ file; `capture4d.files.meshes.read_mesh` is the way in.
+    """Read an OBJ file; `capture4d.mesh_files.meshes.read_mesh` is the way in.
 
     Raises:
         InputError: names the line; the file is named there.

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from capture4d.errors import InputError
-from capture4d.files.meshes import read_coloured_mesh, read_mesh, write_mesh
+from capture4d.mesh_files.meshes import read_coloured_mesh, read_mesh, write_mesh
 from capture4d.types import Mesh
 
 QUAD_AND_TRIANGLE = """\

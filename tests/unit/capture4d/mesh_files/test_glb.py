@@ -13,7 +13,7 @@ import trimesh
 from PIL import Image
 
 from capture4d.errors import InputError
-from capture4d.files.meshes import read_coloured_mesh, read_mesh, write_mesh
+from capture4d.mesh_files.meshes import read_coloured_mesh, read_mesh, write_mesh
 from capture4d.types import Mesh
 
 RNG = np.random.default_rng(4)
@@ -210,7 +210,7 @@ def test_a_hostile_file_is_one_line(name: str, tmp_path: Path) -> None:
 
 
 def test_a_mesh_in_very_many_places_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("capture4d.files.glb._MOST", 100)
+    monkeypatch.setattr("capture4d.mesh_files.glb._MOST", 100)
     tree, binary = square()
     for count, allowed in ((25, True), (26, False)):
         tree["nodes"] = [{"mesh": 0}] * count

@@ -3,7 +3,7 @@
 own npz    poses.npz as in a capture; as it is
 AMASS npz  `poses` (T, 3 J) axis-angle of SMPL's joints, `trans`, `betas`, frame rate under either name, Z up
 BVH        a file with this body's joints is read as it is, with the shape that its bone lengths show; other skeletons
-           are retargeted (see `motion_retarget`). Written in centimetres
+           are retargeted (see `retargeting`). Written in centimetres
 
 Poses of SMPL's joints fit a body of the SMPL family without change (hands beyond the wrist are left out), and other
 bodies by retargeting. What these joints cannot say (a second neck joint, twist bones, hands, another shape space) goes
@@ -20,14 +20,14 @@ import numpy as np
 from jaxtyping import Float, Float64
 from scipy.spatial.transform import Rotation, Slerp
 
-from capture4d.body.bvh import Bvh, format_bvh, read_bvh
-from capture4d.body.motion_retarget import SMPL_TREE, as_smpl, retarget
 from capture4d.body.skinning import ShapedBody, with_shape
 from capture4d.errors import InputError
 from capture4d.files.arrays import ArrayFile
 from capture4d.files.atomic import write_bytes, write_npz
 from capture4d.files.reading import reading
 from capture4d.files.records import load_poses, save_poses
+from capture4d.motions.bvh import Bvh, format_bvh, read_bvh
+from capture4d.motions.retargeting import SMPL_TREE, as_smpl, retarget
 from capture4d.types import Body, PoseSequence
 
 __all__ = ["read_motion", "resample", "write_amass", "write_bvh", "write_motion"]

@@ -1,0 +1,1 @@
+"""Mesh files: obj, ply and glb, with their colours and textures, in and out."""

@@ -1,0 +1,86 @@
+"""Textures: the image that a mesh file names, and its colours at the vertices.
+
+The image is read at every face corner, between pixels, and a vertex takes the mean of its corners: across a seam both
+sides show the same paint.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Float64, Integer, UInt8
+
+from capture4d.errors import InputError
+from capture4d.files.reading import companion
+from capture4d.types import Mesh
+
+__all__ = ["mean_at_vertices", "named_texture", "sampled", "texture_colours"]
+
+_HEAD = 65_536
+
+
+def named_texture(path: Path) -> Path | None:
+    """The one image that the head of an obj (by its mtl) or of a ply names.
+
+    Raises:
+        InputError: it names several, one that is not there, or one that does not lie beside it or in a folder below.
+    """
+    with path.open("rb") as file:
+        head = file.read(_HEAD).decode("utf-8", errors="replace")
+    if path.suffix.lower() == ".ply":
+        names = re.findall(r"^comment TextureFile (.+?)\s*$", head.partition("end_header")[0], re.M)
+    else:
+        names = []
+        for library in re.findall(r"^mtllib (.+?)\s*$", head, re.M):
+            lines = companion(path, library, "materials").read_text(encoding="utf-8", errors="replace")
+            names += re.findall(r"^\s*map_Kd (?:-\S+ \S+ )*(.+?)\s*$", lines, re.M)
+    if len(set(names)) > 1:
+        raise InputError(f"expected one texture, found {', '.join(sorted(set(names)))}", where=path)
+    return companion(path, names[0], "texture") if names else None
+
+
+def texture_colours(mesh: Mesh, image: UInt8[np.ndarray, "rows columns 3"]) -> UInt8[np.ndarray, "verts 3"]:
+    """Sample a texture at the vertices of a mesh with UVs; vertices that no face uses are black.
+
+    Args:
+        image: sRGB; v = 1 is its first row, as in obj files. UVs beyond 0 to 1 repeat it.
+    Raises:
+        InputError: the mesh has no UVs.
+    """
+    if mesh.uv is None:
+        raise InputError("a texture needs UVs, found none")
+    corners = sampled(image, mesh.uv.reshape(-1, 2))
+    return mean_at_vertices(mesh.faces.reshape(-1), corners, len(mesh.vertices))
+
+
+def sampled(
+    image: UInt8[np.ndarray, "rows columns 3"], uv: Float[np.ndarray, "points 2"]
+) -> Float64[np.ndarray, "points 3"]:
+    """A picture between its pixels; v = 1 is its first row, and UVs beyond 0 to 1 repeat it."""
+    rows, columns = image.shape[:2]
+    uv = uv.astype(np.float64)
+    inside = np.where((uv >= 0) & (uv <= 1), uv, uv - np.floor(uv))
+    across = np.clip(inside[:, 0] * columns - 0.5, 0, columns - 1)
+    down = np.clip((1 - inside[:, 1]) * rows - 0.5, 0, rows - 1)
+    left, top = np.floor(across).astype(int), np.floor(down).astype(int)
+    right, bottom = np.minimum(left + 1, columns - 1), np.minimum(top + 1, rows - 1)
+    x, y = (across - left)[:, None], (down - top)[:, None]
+    upper = (1 - x) * image[top, left] + x * image[top, right]
+    lower = (1 - x) * image[bottom, left] + x * image[bottom, right]
+    return (1 - y) * upper + y * lower
+
+
+def mean_at_vertices(
+    vertex: Integer[np.ndarray, " corners"], colours: Float[np.ndarray, "corners 3"], count: int
+) -> UInt8[np.ndarray, "verts 3"]:
+    """The mean of the colours at a vertex's corners; black where it has none.
+
+    Args:
+        vertex: that of each corner.
+        count: of all vertices.
+    """
+    corners = np.maximum(np.bincount(vertex, minlength=count), 1)
+    sums = [np.bincount(vertex, colours[:, channel], minlength=count) for channel in range(3)]
+    return np.clip(np.rint(np.stack(sums, axis=1) / corners[:, None]), 0, 255).astype(np.uint8)

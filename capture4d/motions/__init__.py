@@ -1,0 +1,1 @@
+"""Motions from elsewhere: their files, and from one skeleton to another."""
