@@ -51,7 +51,7 @@ def read_coloured_mesh(path: str | Path) -> MeshFile:
     """
     path = Path(path)
     with reading(path, "mesh file", absent="no such mesh file"):
-        if path.suffix.lower() == ".glb":
+        if path.suffix.lower() in (".glb", ".gltf"):
             return _whole(read_coloured_glb(path))
         found = _whole(_read(path))
         if found.colours is not None:
@@ -68,7 +68,7 @@ def _read(path: Path) -> MeshFile:
             return read_obj(path)
         case ".ply":
             return read_ply(path)
-        case ".glb":
+        case ".glb" | ".gltf":
             return read_glb(path)
         case _:
             raise _unknown(path)

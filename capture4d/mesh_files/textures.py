@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Literal, assert_never
 
 import numpy as np
 from jaxtyping import Float, Float64, Integer, UInt8
@@ -16,9 +17,11 @@ from capture4d.errors import InputError
 from capture4d.files.reading import companion
 from capture4d.types import Mesh
 
-__all__ = ["mean_at_vertices", "named_texture", "sampled", "texture_colours"]
+__all__ = ["Wrap", "mean_at_vertices", "named_texture", "sampled", "texture_colours"]
 
 _HEAD = 65_536
+Wrap = Literal["repeat", "mirror", "clamp"]
+"""How a texture goes on beyond its edges."""
 
 
 def named_texture(path: Path) -> Path | None:
@@ -56,12 +59,18 @@ def texture_colours(mesh: Mesh, image: UInt8[np.ndarray, "rows columns 3"]) -> U
 
 
 def sampled(
-    image: UInt8[np.ndarray, "rows columns 3"], uv: Float[np.ndarray, "points 2"]
+    image: UInt8[np.ndarray, "rows columns 3"],
+    uv: Float[np.ndarray, "points 2"],
+    *,
+    wrap: tuple[Wrap, Wrap] = ("repeat", "repeat"),
 ) -> Float64[np.ndarray, "points 3"]:
-    """A picture between its pixels; v = 1 is its first row, and UVs beyond 0 to 1 repeat it."""
+    """A picture between its pixels; v = 1 is its first row.
+
+    Args:
+        wrap: what is beyond 0 to 1, along u and along v.
+    """
     rows, columns = image.shape[:2]
-    uv = uv.astype(np.float64)
-    inside = np.where((uv >= 0) & (uv <= 1), uv, uv - np.floor(uv))
+    inside = np.column_stack([_inside(along, how) for along, how in zip(uv.astype(np.float64).T, wrap, strict=True)])
     across = np.clip(inside[:, 0] * columns - 0.5, 0, columns - 1)
     down = np.clip((1 - inside[:, 1]) * rows - 0.5, 0, rows - 1)
     left, top = np.floor(across).astype(int), np.floor(down).astype(int)
@@ -70,6 +79,19 @@ def sampled(
     upper = (1 - x) * image[top, left] + x * image[top, right]
     lower = (1 - x) * image[bottom, left] + x * image[bottom, right]
     return (1 - y) * upper + y * lower
+
+
+def _inside(along: Float64[np.ndarray, " points"], wrap: Wrap) -> Float64[np.ndarray, " points"]:
+    """A texture coordinate, from 0 to 1."""
+    match wrap:
+        case "repeat":
+            return np.where((along >= 0) & (along <= 1), along, along - np.floor(along))
+        case "mirror":
+            return 1 - np.abs(np.mod(along, 2) - 1)
+        case "clamp":
+            return np.clip(along, 0, 1)
+        case _:
+            assert_never(wrap)
 
 
 def mean_at_vertices(
