@@ -20,6 +20,8 @@ from capture4d.types import Mesh
 __all__ = ["Wrap", "mean_at_vertices", "named_texture", "sampled", "texture_colours"]
 
 _HEAD = 65_536
+_EDGE = 1e-4
+"""How far beyond its edge a texture does not begin again: rounding put the coordinate there."""
 Wrap = Literal["repeat", "mirror", "clamp"]
 """How a texture goes on beyond its edges."""
 
@@ -85,7 +87,8 @@ def _inside(along: Float64[np.ndarray, " points"], wrap: Wrap) -> Float64[np.nda
     """A texture coordinate, from 0 to 1."""
     match wrap:
         case "repeat":
-            return np.where((along >= 0) & (along <= 1), along, along - np.floor(along))
+            near = (along >= -_EDGE) & (along <= 1 + _EDGE)
+            return np.where(near, np.clip(along, 0, 1), along - np.floor(along))
         case "mirror":
             return 1 - np.abs(np.mod(along, 2) - 1)
         case "clamp":

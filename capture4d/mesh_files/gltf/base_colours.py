@@ -47,13 +47,13 @@ def base_colours(
         pictures: whether textures are looked at; if not, what has one has no colours.
     """
     paints = [_paint(document, primitive) for primitive in primitives]
-    textured = [paint.texture is not None for paint in paints]
-    plain = all(paint.factor is None for paint in paints) and not any("COLOR_0" in each.names for each in primitives)
-    if not (any(textured) if plain else pictures or not any(textured)) or (plain and not pictures):
+    textured = any(paint.texture is not None for paint in paints)
+    factored = any(paint.factor is not None for paint in paints)
+    if not (textured or factored or any("COLOR_0" in primitive.names for primitive in primitives)):
         return None
-    images = {
-        index: _image(document, paint.texture) for index, paint in enumerate(paints) if paint.texture is not None
-    }
+    if textured and not pictures:
+        return None
+    images = {index: _image(document, paint.texture) for index, paint in enumerate(paints) if paint.texture is not None}
     colours: dict[int, np.ndarray] = {}
     for image in sorted(set(images.values())):  # each is opened once, and one at a time
         picture = _picture(document, image)

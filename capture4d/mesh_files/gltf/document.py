@@ -56,7 +56,7 @@ class Document:
     binary: bytes
     size: int
     """Bytes of the file itself."""
-    kept: dict[tuple[str, int], Any] = field(default_factory=dict)
+    kept: dict[tuple[str, Any], Any] = field(default_factory=dict)
     """What has been read or decompressed, that nothing is twice."""
 
     def entry(self, kind: str, index: Any) -> dict[str, Any]:
@@ -189,10 +189,6 @@ def _require_readable(tree: dict[str, Any]) -> None:
     required = tree.get("extensionsRequired") or []
     if not isinstance(required, list):
         raise InputError(f"extensionsRequired: expected a list, found {str(required)[:40]!r}")
-    unknown = [
-        name
-        for name in map(str, required)
-        if name not in _READ and not name.startswith(_SURFACE_IS_THE_SAME)
-    ]
+    unknown = [name for name in map(str, required) if name not in _READ and not name.startswith(_SURFACE_IS_THE_SAME)]
     if unknown:
         raise InputError(f"expected a glTF file that can be read without extensions, found {', '.join(unknown)}")

@@ -62,7 +62,9 @@ def skinned(
     if skin.get("inverseBindMatrices") is not None:
         inverse = accessor_values(document, skin["inverseBindMatrices"])
         if inverse.shape[1] != 16 or len(inverse) < len(joints):
-            raise InputError(f"skins[{index}]: expected a matrix of each of {len(joints)} joints, found {inverse.shape}")
+            raise InputError(
+                f"skins[{index}]: expected a matrix of each of {len(joints)} joints, found {inverse.shape}"
+            )
         places = places @ inverse[: len(joints)].reshape(-1, 4, 4).transpose(0, 2, 1)
     moved, total = np.zeros((len(vertices), 3)), np.zeros(len(vertices))
     for group in range(len(names)):
