@@ -1,1 +1,1 @@
-"""glTF 2.0, binary or not: a scene as one mesh with colours, and a mesh as a file."""
+"""glTF files, binary or not: a scene as one mesh with its base colours, and a mesh as a file."""

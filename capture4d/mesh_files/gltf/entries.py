@@ -23,7 +23,10 @@ def count_of(entry: dict[str, Any], name: str, default: int | None = None) -> in
 
 def numbers_of(entry: dict[str, Any], name: str, default: np.ndarray) -> np.ndarray:
     """Numbers of an entry, as many as there are of the default."""
-    found = np.asarray(entry.get(name, default))
+    try:
+        found = np.asarray(entry.get(name, default))
+    except ValueError:  # lists of several lengths
+        found = np.zeros(0, object)
     if found.dtype.kind not in "iuf" or found.shape != default.shape or not np.isfinite(found).all():
         raise InputError(f"{name}: expected {len(default)} finite numbers, found {str(entry.get(name))[:40]}")
     return found.astype(np.float64)

@@ -146,7 +146,7 @@ def test_a_damaged_draco_payload_is_one_line(payload: bytes, said: str, tmp_path
 
 def test_a_number_that_a_payload_has_not_is_one_line(tmp_path: Path) -> None:
     for ids in ({"POSITION": 77}, {"POSITION": "a"}):
-        with pytest.raises(InputError, match="expected POSITION as number .*, found none"):
+        with pytest.raises(InputError, match=r"expected POSITION as number \w+, found none"):
             read_mesh(draco_file(FLAT, ids).save(tmp_path / "x.glb"))
     file = draco_file(FLAT, ids_of(FLAT))
     file.tree["accessors"][0]["type"] = "VEC2"
@@ -244,11 +244,9 @@ def test_a_damaged_view_is_one_line(change: dict[str, Any], said: str, tmp_path:
 @pytest.mark.parametrize("kind", ["flat", "breaker", "EXT_meshopt_compression", "KHR_meshopt_compression"])
 def test_damaged_bytes_are_a_mesh_or_one_line(kind: str, tmp_path: Path) -> None:
     """The decoders are native: a fault of theirs would end the process."""
-    file = {
-        "flat": lambda: draco_file(FLAT, ids_of(FLAT)),
-        "breaker": lambda: draco_file(BREAKER, ids_of(BREAKER)),
-    }.get(kind, lambda: packed_file(kind, 1))()
-    whole = bytes(file.data)
+    payloads = {"flat": FLAT, "breaker": BREAKER}
+    file = draco_file(payloads[kind], ids_of(payloads[kind])) if kind in payloads else packed_file(kind, 1)
+    whole, said = bytes(file.data), []
     for _ in range(300):
         data = bytearray(whole)
         for place in RNG.integers(0, len(data), RNG.integers(1, 4)):
@@ -257,4 +255,6 @@ def test_damaged_bytes_are_a_mesh_or_one_line(kind: str, tmp_path: Path) -> None
         try:
             read_coloured_mesh(file.save(tmp_path / "x.glb"))
         except InputError as error:
-            assert "\n" not in str(error)
+            said.append(str(error))
+    assert said, "some of it is noticed"
+    assert all("\n" not in line and line.startswith(str(tmp_path)) for line in said)
