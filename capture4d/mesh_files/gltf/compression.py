@@ -6,7 +6,10 @@ see it; of Draco only the newest bitstream, which glTF asks for, and none of the
 
 from __future__ import annotations
 
+import queue
 import struct
+import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,6 +28,8 @@ _MESHOPT_RATIO = 1024
 """Bytes that one byte can stand for: two bits say that a byte of 256 rows stays as it is."""
 _DRACO_RATIO, _DRACO_ALWAYS = 1024, 65_536
 """Faces that a byte can stand for, and those that are always believed: a flat grid has 28 for each byte."""
+_PATIENCE_S, _SLOWEST = 20, 100_000
+"""Seconds for any payload, and bytes in each more: a fiftieth of what it decodes at its slowest level on one core."""
 _DRACO_HEAD = struct.Struct("<5s4BH")
 _METADATA = 0x8000
 
@@ -68,7 +73,7 @@ def draco_mesh(where: str, payload: bytes) -> Draco:
     import DracoPy
 
     try:
-        mesh = DracoPy.decode(payload)
+        mesh = _within(_PATIENCE_S + len(payload) / _SLOWEST, lambda: DracoPy.decode(payload))
         if not isinstance(mesh, DracoPy.DracoMesh):  # what it makes of a mesh without faces
             raise InputError("found no triangles")
         faces = np.asarray(mesh.faces, np.int64).reshape(-1, 3)
@@ -76,6 +81,29 @@ def draco_mesh(where: str, payload: bytes) -> Draco:
     except Exception as error:
         raise InputError(f"{where}: not readable as Draco ({DRACO}), damaged ({one_line(error)})") from None
     return Draco(faces, attributes)
+
+
+def _within(seconds: float, decode: Callable[[], Any]) -> Any:
+    """What a decoder that lets go of Python's lock makes, if it is done in time.
+
+    A few bytes can make Draco read a billion bits. Nobody can stop it then; it ends by itself, or with the process.
+    """
+    done: queue.SimpleQueue[tuple[Any, Exception | None]] = queue.SimpleQueue()
+
+    def run() -> None:
+        try:
+            done.put((decode(), None))
+        except Exception as error:
+            done.put((None, error))
+
+    threading.Thread(target=run, daemon=True).start()
+    try:
+        found, error = done.get(timeout=seconds)
+    except queue.Empty:
+        raise InputError(f"not done in {seconds:.0f} s") from None
+    if error is not None:
+        raise error
+    return found
 
 
 def _plain(payload: bytes) -> bytes:

@@ -1,5 +1,6 @@
 """Draco and meshoptimizer: what their encoders packed is read as it was, and what is damaged is one line."""
 
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -151,6 +152,15 @@ def test_a_number_that_a_payload_has_not_is_one_line(tmp_path: Path) -> None:
     file = draco_file(FLAT, ids_of(FLAT))
     file.tree["accessors"][0]["type"] = "VEC2"
     assert len(read_mesh(file.save(tmp_path / "x.glb")).mesh.vertices) == len(VERTICES), "the payload knows better"
+
+
+def test_a_payload_that_takes_for_ever_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    let_go = threading.Event()
+    monkeypatch.setattr(DracoPy, "decode", lambda payload: let_go.wait())
+    monkeypatch.setattr("capture4d.mesh_files.gltf.compression._PATIENCE_S", 0.01)
+    with pytest.raises(InputError, match=r"not readable as Draco .+not done in 0 s"):
+        read_mesh(draco_file(FLAT, {"POSITION": 0}).save(tmp_path / "x.glb"))
+    let_go.set()
 
 
 # --- meshoptimizer -----------------------------------------------------------------------------------------------
