@@ -1,7 +1,6 @@
 """Base colours: textures, factors and vertex colours, against the standard's arithmetic one vertex at a time."""
 
 import io
-import json
 from pathlib import Path
 from typing import Any
 
@@ -324,4 +323,11 @@ def test_colours_that_are_no_numbers_or_too_bright_are_still_colours(tmp_path: P
     light = np.tile(np.array([np.nan, 7.0, -1.0], np.float32), (16, 1))
     file, _ = sheet(light=light)
     assert colours(file, tmp_path) == 16 * [[0, 255, 0]]
-    json.dumps(file.tree)
+
+
+def test_a_texture_does_not_begin_again_a_hair_beyond_its_edge(tmp_path: Path) -> None:
+    """Where the rounding of a compressed coordinate puts it."""
+    uv = np.tile([[1 + 2e-7, -3e-5]], (16, 1))
+    file, primitive = sheet(uv)
+    primitive["material"] = file.add("materials", {METAL: {"baseColorTexture": file.texture(picture())}})
+    assert colours(file, tmp_path)[0] == PIXELS[0, 3].tolist()
