@@ -1,5 +1,6 @@
 """Base colours: textures, factors and vertex colours, against the standard's arithmetic one vertex at a time."""
 
+import base64
 import io
 from pathlib import Path
 from typing import Any
@@ -331,3 +332,17 @@ def test_a_texture_does_not_begin_again_a_hair_beyond_its_edge(tmp_path: Path) -
     file, primitive = sheet(uv)
     primitive["material"] = file.add("materials", {METAL: {"baseColorTexture": file.texture(picture())}})
     assert colours(file, tmp_path)[0] == PIXELS[0, 3].tolist()
+
+
+def test_images_lie_in_the_json_or_beside_the_file(tmp_path: Path) -> None:
+    body = base64.b64encode(picture()).decode()
+    (tmp_path / "inner").mkdir()
+    (tmp_path / "inner" / "ä b.png").write_bytes(picture())
+    for uri in (f"data:image/png;base64,{body}", "inner/%C3%A4%20b.png", "inner/ä b.png", "inner\\ä b.png"):
+        for suffix in (".glb", ".gltf"):
+            file, primitive = sheet()
+            file.add("images", {"uri": uri})
+            texture = {"index": file.add("textures", {"source": 0})}
+            primitive["material"] = file.add("materials", {METAL: {"baseColorTexture": texture}})
+            found = read_coloured_mesh(file.save(tmp_path / f"x{suffix}")).colours
+            np.testing.assert_array_equal(found, PIXELS.reshape(16, 3))
