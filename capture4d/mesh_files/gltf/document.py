@@ -110,18 +110,14 @@ class Document:
 
     def beside(self, kind: str, uri: str) -> Path:
         """The file that a buffer or an image is in."""
-        what = "buffer" if kind == "buffers" else "texture"
         plain = uri.replace("\\", "/")
-        try:
-            return companion(self.path, unquote(plain), what)
-        except InputError:
-            if unquote(plain) == plain or ".." in unquote(plain):
-                raise
+        faults: list[InputError] = []
+        for name in dict.fromkeys((unquote(plain), plain)):  # some programs write names as they are
             try:
-                return companion(self.path, plain, what)  # a name that has a per cent sign in it
-            except InputError:
-                pass
-            raise
+                return companion(self.path, name, "buffer" if kind == "buffers" else "texture")
+            except InputError as fault:
+                faults.append(fault)
+        raise faults[0]
 
     def zeros(self, where: str, count: int, width: int, dtype: np.dtype) -> np.ndarray:
         """Rows of an accessor that has no bytes of its own."""

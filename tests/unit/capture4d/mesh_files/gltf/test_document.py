@@ -103,6 +103,8 @@ def test_a_name_with_a_per_cent_sign_and_the_name_that_it_stands_for(tmp_path: P
     (tmp_path / "a%20b.bin").write_bytes(bytes(len(file.data)))
     (tmp_path / "a b.bin").write_bytes(bytes(file.data))
     require_sheet(file.save(tmp_path / "x.gltf", uri="a%20b.bin"))
+    (tmp_path / "a b.bin").rename(tmp_path / "a%20b.bin")
+    require_sheet(file.save(tmp_path / "x.gltf", uri="a%20b.bin"))
 
 
 def test_data_in_the_json_in_all_its_spellings(tmp_path: Path) -> None:
