@@ -27,7 +27,7 @@ __all__ = ["MOST", "Document", "open_document"]
 MOST = 100_000_000
 """Vertices, or faces, of a scene: a small file can place a mesh many times."""
 _ZEROS_A_BYTE, _ZEROS_ALWAYS = 64, 65_536
-"""Rows that an accessor without bytes may have: for each byte of the file, or in any file."""
+"""Rows that an accessor without bytes may have: for each byte of the file and its buffers, or in any file."""
 _JSON, _BINARY = b"JSON", b"BIN\0"
 _READ = {
     "EXT_meshopt_compression",
@@ -121,7 +121,10 @@ class Document:
 
     def zeros(self, where: str, count: int, width: int, dtype: np.dtype) -> np.ndarray:
         """Rows of an accessor that has no bytes of its own."""
-        most = min(MOST, max(_ZEROS_ALWAYS, _ZEROS_A_BYTE * self.size))
+        buffers = self.tree.get("buffers")
+        elsewhere = [index for index, each in enumerate(buffers or []) if isinstance(each, dict) and "uri" in each]
+        size = self.size + sum(len(self.bytes_of("buffers", index)) for index in elsewhere)
+        most = min(MOST, max(_ZEROS_ALWAYS, _ZEROS_A_BYTE * size))
         if count > most:
             raise InputError(f"{where}: expected a buffer view, found none for {count} elements")
         return np.zeros((count, width), dtype)

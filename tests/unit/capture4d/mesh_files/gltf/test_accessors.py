@@ -152,3 +152,20 @@ def test_zeros_take_no_more_room_than_a_file_can_mean(tmp_path: Path) -> None:
     file.tree["accessors"][colours]["count"] = 90_000_000
     with pytest.raises(InputError, match="expected a buffer view, found none for 90000000 elements"):
         read_coloured_mesh(file.save(tmp_path / "x.glb"))
+
+
+def test_a_large_surface_may_be_zeros_but_for_some_rows(tmp_path: Path) -> None:
+    """Beside a file whose JSON is small."""
+    count = 70_000
+    points = np.zeros((count, 3), np.float32)
+    points[-3:] = np.eye(3)
+    file = GltfFile()
+    position = file.accessor(points, layout="over zeros")
+    indices = file.accessor(np.arange(count - 3, count), 5125)
+    file.primitive({"POSITION": position}, indices=indices)
+    sparse = file.tree["accessors"][position]["sparse"]["indices"]
+    sparse |= {"bufferView": file.view(np.arange(count - 3, count).astype("<u4").tobytes()), "byteOffset": 0}
+    sparse["componentType"] = 5125
+    (tmp_path / "x.bin").write_bytes(bytes(file.data) + bytes(2000))
+    found = read_mesh(file.save(tmp_path / "x.gltf", uri="x.bin")).mesh
+    np.testing.assert_array_equal(found.vertices, points)
