@@ -35,7 +35,7 @@ from retarget.regression.learning import (
     vertex_error_m,
 )
 from retarget.regression.linear import LinearRegressor, fit_linear
-from retarget.regression.pose_range import nearest_poses, pose_quaternions
+from retarget.regression.known_range import nearest_poses, pose_quaternions
 from retarget.regression.regressors import Clip, FittingClips, Regressor
 from retarget.regression.splits import Piece
 from retarget.regression.training import fit_lstm
