@@ -47,7 +47,9 @@ SAFE_DEG = (10.0, 20.0)
 """A pose as near as the first to a learned one is safe, even if no validation frame was as far; one farther than the
 second is not, even if such frames validated."""
 FADED = 3.0
-"""Times the safe distance, or the largest motion that was learned, where nothing of a regressor's answer is left."""
+"""Times the largest motion that was learned, where nothing of it is left."""
+FADED_POSES = 2.0
+"""Times the safe distance, where nothing of a regressor's answer is left."""
 NEAREST_SHARE = 0.15
 """Learned poses count in the nearest safe point as far as they are nearer than this share beyond the nearest: the point
 then moves without jumps."""
@@ -139,7 +141,7 @@ class ControlRange:
             if moves:
                 offset = found[:, part] - self.mean[part]
                 length = np.linalg.norm(offset, axis=1) / max(float(largest), 1e-9)
-                kept = np.where(length <= 1, 1.0, _fading(length) / np.maximum(length, 1.0))
+                kept = np.where(length <= 1, 1.0, _fading(length, FADED) / np.maximum(length, 1.0))
                 found[:, part] = self.mean[part] + kept[:, None] * offset
         columns = layout.pose_columns
         turned = slice(0, 6 * len(layout.joints))
@@ -148,12 +150,12 @@ class ControlRange:
         apart = _degrees(offset[:, turned])
         inward = np.minimum(1.0, safe_deg / np.maximum(apart, 1e-9))
         found[:, columns] = anchors + inward[:, None] * offset
-        return found.astype(np.float32), _fading(distances / safe_deg)
+        return found.astype(np.float32), _fading(distances / safe_deg, FADED_POSES)
 
 
-def _fading(times: Float[np.ndarray, " frames"]) -> Float64[np.ndarray, " frames"]:
-    """1 up to 1, then smoothly down to 0 at `FADED`."""
-    beyond = np.clip((np.asarray(times, np.float64) - 1) / (FADED - 1), 0, 1)
+def _fading(times: Float[np.ndarray, " frames"], gone: float) -> Float64[np.ndarray, " frames"]:
+    """1 up to 1, then smoothly down to 0."""
+    beyond = np.clip((np.asarray(times, np.float64) - 1) / (gone - 1), 0, 1)
     return 1 - beyond**2 * (3 - 2 * beyond)
 
 
