@@ -221,10 +221,13 @@ class AnimateConfig:
     """Putting a learned garment on a motion and a body."""
 
     regressor: Literal["auto", "ensemble", "kernel", "lstm", "linear"] = "auto"
-    """`auto`: the first of these that the model has. `ensemble` is the mean of kernels and LSTM."""
+    """`auto`: the one that did best on the frames that validated. `ensemble` is the mean of kernels and LSTM."""
     mean: Literal["corrected", "printed", "captured"] = "corrected"
     """How the mean meets another body: moved by the difference of the two bodies (Eq. 5, corrected), by the new body's
     whole offset from the average person (as printed), or not at all."""
+    longest: NonNegative = 1.2
+    """Edges are drawn together to this many times their length in the mean garment on the person, or as far as they
+    stretched in what was learned from, if that is more; 0: they stay as long as they come."""
     unlike_deg: NonNegative = 10.0
     """A pose farther than this from every training pose is reported, unless the model was validated farther away."""
     removal: RemovalConfig = field(default_factory=RemovalConfig)

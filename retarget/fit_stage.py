@@ -35,19 +35,20 @@ from retarget.fit_takes import RegisteredTake, read_takes, stack_takes, unpose_t
 from retarget.model_folder import KERNEL, LINEAR, LSTM, MODEL, POSES, piece_name, shapes_digest
 from retarget.regression.controls import ControlLayout
 from retarget.regression.ensemble import regressors_by_name
-from retarget.regression.kernel import KernelRegressor, fit_kernel, load_kernel, save_kernel
+from retarget.regression.kernel import fit_kernel, load_kernel, save_kernel
+from retarget.regression.known_range import CoefficientRange, ControlRange, KnownRange, PoseRange, save_known_range
 from retarget.regression.learning import (
     Projected,
     UnposedTakes,
     fitting_clips,
     learn_shapes,
+    learned_stretch,
     predictions,
     regression_clips,
     training_poses,
     vertex_error_m,
 )
 from retarget.regression.linear import LinearRegressor, fit_linear, save_linear
-from retarget.regression.pose_range import save_pose_range
 from retarget.regression.regressors import FittingClips, Regressor, mean_squared_error
 from retarget.regression.splits import ROLES, Piece, split_takes
 from retarget.shapes.blendshapes import ShapeSpace, as_model_arrays, shape_space, worst_errors
@@ -56,7 +57,7 @@ from retarget.shapes.mirroring import Mirror, find_mirror
 
 __all__ = ["run"]
 
-SCHEMA = 4
+SCHEMA = 5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -150,10 +151,9 @@ def _learn(stage: Stage, lesson: _Lesson, config: FitConfig, device: str) -> dic
     model, shape_note = _blendshapes(stage, lesson, config)
     layout = ControlLayout.create(body, takes.skin_weights, lesson.fps, config.control)
     mirror = find_mirror(model.garment.template.with_vertices(model.mean), body.joint_names, config.mirror)
-    known = training_poses(takes, pieces, layout, mirror)
-    save_pose_range(stage.path / POSES, known, model_digest=shapes_digest(stage.path))
-    note = _regressors(stage, lesson, layout, shape_space(model), mirror, config, device)
-    return {"validated_deg": known.validated_deg, **shape_note, **note}
+    poses = training_poses(takes, pieces, layout, mirror)
+    note = _regressors(stage, lesson, layout, shape_space(model), mirror, poses, config, device)
+    return {"validated_deg": poses.validated_deg, **shape_note, **note}
 
 
 def _blendshapes(stage: Stage, lesson: _Lesson, config: FitConfig) -> tuple[BlendshapeModel, dict[str, Any]]:
@@ -192,6 +192,7 @@ def _regressors(
     layout: ControlLayout,
     space: ShapeSpace,
     mirror: Mirror | None,
+    poses: PoseRange,
     config: FitConfig,
     device: str,
 ) -> dict[str, Any]:
@@ -201,23 +202,29 @@ def _regressors(
     clips = fitting_clips(lesson.takes, lesson.pieces, layout, space, mirror, projected)
     linear = fit_linear(clips, layout, space.std, config.linear)
     save_linear(stage.path / LINEAR, linear, model_digest=digest)
+    ranges = {"linear": ControlRange.of(clips.all, layout)}
     kernel = network = None
     if config.regressor != "linear":
+        own = ControlLayout.create(lesson.body, lesson.takes.skin_weights, layout.fps, config.kernel.control)
+        wider = fitting_clips(lesson.takes, lesson.pieces, own, space, mirror, projected)
+        ranges["kernel"] = ControlRange.of(wider.all, own)
         if not (stage.path / KERNEL).is_file():
-            own = ControlLayout.create(lesson.body, lesson.takes.skin_weights, layout.fps, config.kernel.control)
-            wider = fitting_clips(lesson.takes, lesson.pieces, own, space, mirror, projected)
             learned = fit_kernel(wider, own, space.std, config.kernel)
             save_kernel(stage.path / KERNEL, learned, model_digest=digest)
         kernel = load_kernel(stage.path / KERNEL, model_digest=digest)
     if config.regressor == "all":
         network = _network(stage, clips, linear, space, config, device)
+    stretch = learned_stretch(lesson.takes, lesson.pieces, space, lesson.garment.template.faces)
+    known = KnownRange(poses, ranges, CoefficientRange.of(clips.all, space.std), stretch)
+    save_known_range(stage.path / POSES, known, model_digest=digest)
     note: dict[str, Any] = {
         "mirrored": mirror is not None,
         "control_numbers": layout.size,
         "joints": [layout.joint_names[j] for j in layout.joints],
     }
-    for name, regressor in regressors_by_name(linear, network, kernel).items():
-        note[name] = {"ridge": regressor.ridge} if isinstance(regressor, (LinearRegressor, KernelRegressor)) else {}
+    ridges = {"linear": linear.ridge} if kernel is None else {"linear": linear.ridge, "kernel": kernel.ridge}
+    for name, regressor in regressors_by_name(known, linear, network, kernel).items():
+        note[name] = {"ridge": ridges[name]} if name in ridges else {}
         note[name] |= _errors(lesson, regressor, space, projected)
     return note
 

@@ -15,6 +15,7 @@ from capture4d.body.skinning import ShapedBody, pose_frame
 from capture4d.geometry.intersection_removal import ClosedSurface, IntersectionRemoval, Removed
 from capture4d.geometry.mesh import unique_edges
 from capture4d.types import BlendshapeModel, PoseSequence
+from retarget.animation.strain import StrainLimit
 from retarget.config import AnimateConfig
 from retarget.shapes.blendshapes import reconstruct, skin_frames
 
@@ -40,6 +41,7 @@ class Animator:
 
     Args:
         mean: the garment's mean in that person's rest pose, metres.
+        stretch_p99: how far its edges stretched in what it was learned from, `KnownRange.stretch_p99`.
     """
 
     def __init__(
@@ -48,6 +50,8 @@ class Animator:
         person: ShapedBody,
         mean: Float64[np.ndarray, "verts 3"],
         config: AnimateConfig,
+        *,
+        stretch_p99: float = 1.0,
     ) -> None:
         assert model.garment.skin_weights is not None
         self._basis, self._weights = model.basis, model.garment.skin_weights
@@ -56,6 +60,8 @@ class Animator:
         self._edges = unique_edges(faces)
         self._lengths = self._edge_lengths(mean)
         self._removal = IntersectionRemoval(faces, len(mean), config.removal)
+        longest = max(config.longest, stretch_p99) if config.longest else np.inf
+        self._limit = StrainLimit(self._edges, self._lengths, len(mean), longest)
 
     def _edge_lengths(self, vertices: np.ndarray) -> np.ndarray:
         return np.linalg.norm(vertices[self._edges[:, 0]] - vertices[self._edges[:, 1]], axis=1)
@@ -70,7 +76,8 @@ class Animator:
         faces = self._person.body.template.faces
         found = []
         for vertices, body in zip(placed, posed, strict=True):
-            removed = self._removal(vertices, ClosedSurface(body.vertices(), faces))
+            surface = ClosedSurface(body.vertices(), faces)
+            removed = self._removal(self._limit(vertices), surface)
             stretch = self._edge_lengths(removed.vertices) / np.maximum(self._lengths, 1e-9)
             found.append(AnimatedFrame(removed.vertices.astype(np.float32), removed, float(np.percentile(stretch, 99))))
         return found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,8 +21,8 @@ from retarget.model_folder import KERNEL, LINEAR, LSTM, MODEL, POSES, shapes_dig
 from retarget.regression.controls import control_vectors
 from retarget.regression.ensemble import regressors_by_name
 from retarget.regression.kernel import KernelRegressor, load_kernel
+from retarget.regression.known_range import KnownRange, load_known_range
 from retarget.regression.linear import LinearRegressor, load_linear
-from retarget.regression.pose_range import PoseRange, load_pose_range
 from retarget.regression.regressors import Regressor
 from retarget.shapes.files import load_blendshapes
 
@@ -43,18 +43,27 @@ class GarmentModel:
     linear: LinearRegressor
     kernel: KernelRegressor | None
     lstm: Regressor | None
-    poses: PoseRange
+    limits: KnownRange
+    validated: Mapping[str, float]
+    """Vertex errors of the regressors on the frames that validated, mm."""
     digest: str
     """Of the blendshapes' file."""
 
     @property
     def regressors(self) -> dict[str, Regressor]:
-        """Those that the model has, by name; the best last."""
-        return regressors_by_name(self.linear, self.lstm, self.kernel)
+        """Those that the model has, by name. Far from what they were taught they fade towards the mean garment."""
+        return regressors_by_name(self.limits, self.linear, self.lstm, self.kernel)
+
+    @property
+    def best_name(self) -> str:
+        """The regressor that did best on the frames that validated; without such frames, the last there is."""
+        found = list(self.regressors)
+        errors = {name: self.validated[name] for name in found if name in self.validated}
+        return min(errors, key=lambda name: errors[name]) if len(errors) == len(found) else found[-1]
 
     @property
     def best(self) -> Regressor:
-        return list(self.regressors.values())[-1]
+        return self.regressors[self.best_name]
 
     def person(self, beta: Sequence[float] | Float[np.ndarray, " betas"] | None = None) -> ShapedBody:
         """Somebody with the model's body.
@@ -90,7 +99,7 @@ class GarmentModel:
         config = AnimateConfig(removal=RemovalConfig(enabled=remove_intersections))
         motion = replace(pose, shape=np.asarray(person.shape, np.float32))
         mean = retargeted_mean(self.model, captured_person(self.model, self.body), person, formula=config.mean)
-        animator = Animator(self.model, person, mean, config)
+        animator = Animator(self.model, person, mean, config, stretch_p99=self.limits.stretch_p99)
         coefficients = regressor.predict(control_vectors(regressor.layout, motion))
         count = len(motion.frame_ids)
         chunks = [range(start, min(start + FRAMES_AT_ONCE, count)) for start in range(0, count, FRAMES_AT_ONCE)]
@@ -119,8 +128,17 @@ def load_garment_model(path: str | Path, *, device: str = "cpu", with_lstm: bool
         from retarget.regression.lstm import load_lstm
 
         lstm = load_lstm(folder / LSTM, model_digest=digest, linear=linear, device=device)
-    known = load_pose_range(folder / POSES, model_digest=digest)
-    return GarmentModel(folder, model, load_body(folder / "body.npz"), linear, kernel, lstm, known, digest)
+    known = load_known_range(folder / POSES, model_digest=digest)
+    body, validated = load_body(folder / "body.npz"), _validated(folder)
+    return GarmentModel(folder, model, body, linear, kernel, lstm, known, validated, digest)
+
+
+def _validated(folder: Path) -> dict[str, float]:
+    """Vertex errors of the regressors on the frames that validated, mm, as far as fit.json tells."""
+    path = folder / "fit.json"
+    note = read_json(path) if path.is_file() else {}
+    errors = {name: note.get(name, {}).get("validation") for name in ("linear", "lstm", "kernel", "ensemble")}
+    return {name: float(each["vertex_error_mm"]) for name, each in errors.items() if each}
 
 
 def _model_folder(path: Path) -> Path:

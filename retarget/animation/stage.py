@@ -40,9 +40,9 @@ __all__ = ["Wearer", "run", "run_on_coefficients"]
 SCHEMA = 1
 INSIDE_CHECK_PERCENT = 0.3
 """A frame with more of its vertices inside the body, after all, is flagged."""
-STRETCH_FAIL = 2.5
-"""A frame with edges so much longer than the mean garment's, 99th percentile, has failed: cloth does not stretch like
-that. It is where registration gives up as well (`--quality.stretch-fail`)."""
+STRETCH_CHECK, STRETCH_FAIL = 1.4, 2.5
+"""A frame with edges so much longer than the mean garment's, 99th percentile, is flagged, or has failed: cloth does not
+stretch like that. The limits are registration's (`--quality.stretch-check`, `--quality.stretch-fail`)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +148,7 @@ def _model(path: Path, config: AnimateConfig, device: str) -> tuple[GarmentModel
     """The model, and which of its regressors is meant; torch is loaded only if the LSTM takes part."""
     known = load_garment_model(path, device=device, with_lstm=config.regressor in ("auto", "ensemble", "lstm"))
     found = list(known.regressors)
-    name = found[-1] if config.regressor == "auto" else config.regressor
+    name = known.best_name if config.regressor == "auto" else config.regressor
     if name not in found:
         apart = name == "ensemble" and {"kernel", "lstm"} <= {*found}
         why = "; its kernels do not see all that its LSTM sees" if apart else ""
@@ -236,10 +236,11 @@ def _animate(
     pending = set(stage.pending(frame_ids))
     rows = [row for row, frame_id in enumerate(frame_ids) if frame_id in pending]
     chunks = [tuple(rows[start : start + FRAMES_AT_ONCE]) for start in range(0, len(rows), FRAMES_AT_ONCE)]
-    unlike = max(config.unlike_deg, known.poses.validated_deg)
-    shared = _Motion(stage, motion, coefficients, known.poses.distances(motion), unlike)
+    unlike = max(config.unlike_deg, known.limits.poses.validated_deg)
+    shared = _Motion(stage, motion, coefficients, known.limits.poses.distances(motion), unlike)
     write = partial(_write_frames, shared)
-    prepare = partial(Animator, known.model, scene.person, scene.mean, config)
+    stretch = known.limits.stretch_p99
+    prepare = partial(Animator, known.model, scene.person, scene.mean, config, stretch_p99=stretch)
     for _ in run_jobs(write, chunks, prepare=prepare, workers=workers, label="animate", units=len):
         pass
     return _collect(stage, frame_ids)
@@ -256,8 +257,9 @@ def _write_frame(shared: _Motion, row: int, frame: AnimatedFrame) -> None:
     frame_id, distance_deg = int(shared.poses.frame_ids[row]), float(shared.distances_deg[row])
     reasons = []
     torn = not frame.stretch_p99 <= STRETCH_FAIL
-    if torn:
-        reasons.append(f"edges {frame.stretch_p99:.3g} times as long as the mean garment's > {STRETCH_FAIL:g}")
+    if not frame.stretch_p99 <= STRETCH_CHECK:
+        limit = STRETCH_FAIL if torn else STRETCH_CHECK
+        reasons.append(f"edges {frame.stretch_p99:.3g} times as long as the mean garment's > {limit:g}")
     if distance_deg > shared.unlike_deg:
         reasons.append(f"pose {distance_deg:.0f} deg from every pose that was learned > {shared.unlike_deg:.0f}")
     if removed.after.inside_percent > INSIDE_CHECK_PERCENT:

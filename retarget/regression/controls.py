@@ -96,6 +96,19 @@ class ControlLayout:
         lagging = "lag" if not config.whole_rotations else "lag with whole rotations"
         return [*parts, *(((lagging, lag), rotations * self.rotation_sets) for lag in config.lags)]
 
+    @property
+    def parts(self) -> list[tuple[str, slice, bool]]:
+        """What stands in a control vector: name, where, and whether it says how things move, not how they are."""
+        ends = np.cumsum([0, *self.kinds]).tolist()
+        still = ("rotations", "whole rotations", "up")
+        return [(name, slice(ends[i], ends[i + 1]), name not in still) for i, ((name, _), _) in enumerate(self._parts)]
+
+    @property
+    def pose_columns(self) -> Int64[np.ndarray, " poses"]:
+        """Where a control vector says how things are; the garment's joints against their parents come first."""
+        found = [np.arange(part.start, part.stop) for _, part, moves in self.parts if not moves]
+        return np.concatenate(found).astype(np.int64)
+
     def columns_of(self, other: ControlLayout) -> Int64[np.ndarray, " controls"] | None:
         """Where another layout's controls stand in these; None: they are not all here."""
         if (self.joint_names, self.joints, self.fps) != (other.joint_names, other.joints, other.fps):

@@ -12,8 +12,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int64
 
 from retarget.regression.controls import ControlLayout
-from retarget.regression.kernel import KernelRegressor
-from retarget.regression.linear import LinearRegressor
+from retarget.regression.known_range import KnownRange
 from retarget.regression.regressors import Regressor
 
 __all__ = ["EnsembleRegressor", "ensemble", "regressors_by_name"]
@@ -69,9 +68,10 @@ def ensemble(kernel: Regressor, network: Regressor) -> EnsembleRegressor | None:
 
 
 def regressors_by_name(
-    linear: LinearRegressor, lstm: Regressor | None, kernel: KernelRegressor | None
+    known: KnownRange, linear: Regressor, lstm: Regressor | None, kernel: Regressor | None
 ) -> dict[str, Regressor]:
-    """The regressors that there are; the best last."""
-    both = None if lstm is None or kernel is None else ensemble(kernel, lstm)
-    found = {"linear": linear, "lstm": lstm, "kernel": kernel, "ensemble": both}
-    return {name: each for name, each in found.items() if each is not None}
+    """The regressors that there are, within what is known."""
+    single = {"linear": linear, "lstm": lstm, "kernel": kernel}
+    found: dict[str, Regressor] = {name: known.bounded(name, each) for name, each in single.items() if each is not None}
+    both = ensemble(found["kernel"], found["lstm"]) if {"kernel", "lstm"} <= {*found} else None
+    return found if both is None else {**found, "ensemble": both}

@@ -71,7 +71,8 @@ class Modelled:
                 shape[:] = 0
                 shape[: len(first)] = first[: len(shape)]
             person = with_shape(body, shape)
-            animator = Animator(model, person, retargeted_mean(model, captured, person), AnimateConfig())
+            mean, stretch = retargeted_mean(model, captured, person), self.known.limits.stretch_p99
+            animator = Animator(model, person, mean, AnimateConfig(), stretch_p99=stretch)
             (frame,) = animator.frames(self.poses, self.coefficients, [row])
             posed = pose_frame(person, self.poses, row).vertices().astype(np.float32)
             garment = model.garment.template.with_vertices(frame.vertices)

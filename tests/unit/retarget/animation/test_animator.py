@@ -13,7 +13,7 @@ from capture4d.geometry.intersection_removal import ClosedSurface, IntersectionR
 from capture4d.types import BlendshapeModel, Body, Garment
 from retarget.animation.bodies import captured_person, retargeted_mean
 from retarget.config import RemovalConfig
-from retarget.regression.pose_range import nearest_poses, pose_quaternions
+from retarget.regression.known_range import nearest_poses, pose_quaternions
 from retarget.shapes.pose_normalisation import unpose_frame
 
 

@@ -1,0 +1,321 @@
+"""What a garment was learned from, and answers that stay within it.
+
+A regressor is believed where it was taught. The distance of two poses is the root mean square, over the garment's
+joints, of the angle between their rotations. Farther from every learned pose than is known to be safe, the regressor is
+asked about the nearest point that is safe, and its answer fades towards the mean garment. How the root moves and how
+the joints turn is judged part by part: beyond what was learned, a part fades towards its mean, so that what is left is
+what the pose alone can say. Coefficients stay within those of the learned frames.
+
+Letters: N learned frames, D controls, K coefficients.
+References: DeepWrinkles (ECCV 2018), section 5.3: retargeting works best near the training poses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64, Int64
+from scipy.spatial.transform import Rotation
+
+from capture4d.errors import InputError
+from capture4d.files.tensors import read_tensors, write_tensors
+from capture4d.types import PoseSequence
+from retarget.regression.controls import ControlLayout
+from retarget.regression.regressors import Clip, Regressor, good_frames
+
+__all__ = [
+    "BoundedRegressor",
+    "CoefficientRange",
+    "ControlRange",
+    "KnownRange",
+    "PoseRange",
+    "load_known_range",
+    "nearest_poses",
+    "pose_quaternions",
+    "save_known_range",
+]
+
+_KIND = "capture4d known range"
+PAIRS = 4_000_000
+"""Joint angles that are compared at once."""
+MOST_POSES = 1000
+"""Learned poses that are kept for a regressor, evenly spread."""
+SAFE_DEG = (10.0, 20.0)
+"""A pose as near as the first to a learned one is safe, even if no validation frame was as far; one farther than the
+second is not, even if such frames validated."""
+FADED = 3.0
+"""Times the largest motion that was learned, where nothing of it is left."""
+FADED_POSES = 2.0
+"""Times the safe distance, where nothing of a regressor's answer is left."""
+NEAREST_SHARE = 0.15
+"""Learned poses count in the nearest safe point as far as they are nearer than this share beyond the nearest: the point
+then moves without jumps."""
+NUMBERS_OF_A_RADIAN = np.sqrt(4 / 3)
+"""Length, on average over axes, of the change of two columns of a rotation matrix, for each radian of a small turn."""
+LEAST_MOTION = {"velocity": 0.1, "acceleration": 1.0, "turning": 0.5}
+"""Motion that is always taken for known: m/s, m/s^2, rad/s; a hand's breadth at arm's length."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseRange:
+    """The poses a garment was learned from."""
+
+    quaternions: Float32[np.ndarray, "training joints 4"]
+    joints: tuple[int, ...]
+    """The garment's, as positions in the skeleton."""
+    validated_deg: float
+    """How far validation frames were from the training poses while they validated, 95 %."""
+
+    def distances(self, poses: PoseSequence) -> Float64[np.ndarray, " frames"]:
+        """Degrees to the nearest learned pose."""
+        return nearest_poses(pose_quaternions(poses.rotations, self.joints), self.quaternions)[0]
+
+
+def pose_quaternions(
+    rotations: Float[np.ndarray, "frames all 3 3"], joints: tuple[int, ...]
+) -> Float32[np.ndarray, "frames joints 4"]:
+    """Rotations of some joints as unit quaternions."""
+    chosen = rotations[:, list(joints)].astype(np.float64)
+    return Rotation.from_matrix(chosen.reshape(-1, 3, 3)).as_quat().reshape(*chosen.shape[:2], 4).astype(np.float32)
+
+
+def nearest_poses(
+    poses: Float32[np.ndarray, "frames joints 4"], training: Float32[np.ndarray, "training joints 4"]
+) -> tuple[Float64[np.ndarray, " frames"], Int64[np.ndarray, " frames"]]:
+    """Distance in degrees to the nearest training pose, and which it is."""
+    distance, nearest = np.zeros(len(poses)), np.zeros(len(poses), np.int64)
+    joints = poses.shape[1]
+    if not joints or not len(training):
+        return distance, nearest
+    size = max(1, PAIRS // (len(training) * joints))
+    for start in range(0, len(poses), size):
+        part = poses[start : start + size].astype(np.float64)
+        cosine = np.abs(np.einsum("tjq,njq->tnj", part, training.astype(np.float64)))
+        squares = np.mean((2 * np.arccos(np.minimum(cosine, 1.0))) ** 2, axis=2)
+        nearest[start : start + size] = np.argmin(squares, axis=1)
+        distance[start : start + size] = np.degrees(np.sqrt(squares.min(axis=1)))
+    return distance, nearest
+
+
+# --- controls ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ControlRange:
+    """The controls of one layout that were learned from."""
+
+    mean: Float32[np.ndarray, " controls"]
+    largest: Float32[np.ndarray, " parts"]
+    """For each part of the layout, the largest distance of a learned frame from the mean; poses have none, 0."""
+    poses: Float32[np.ndarray, "learned poses"]
+    """What of the controls of some learned frames is their pose."""
+
+    @staticmethod
+    def of(clips: Sequence[Clip], layout: ControlLayout) -> ControlRange:
+        """That of clips, without the history.
+
+        Raises:
+            InputError: there are not two good frames.
+        """
+        controls = good_frames(clips)[0][:, : layout.size].astype(np.float64)
+        mean = controls.mean(axis=0)
+        largest = [
+            max(float(np.linalg.norm(controls[:, part] - mean[part], axis=1).max()), LEAST_MOTION.get(name, 0.0))
+            if moves
+            else 0.0
+            for name, part, moves in layout.parts
+        ]
+        kept = np.linspace(0, len(controls) - 1, min(len(controls), MOST_POSES)).round().astype(int)
+        poses = controls[kept][:, layout.pose_columns]
+        return ControlRange(mean.astype(np.float32), np.array(largest, np.float32), poses.astype(np.float32))
+
+    def bounded(
+        self, controls: Float[np.ndarray, "frames controls"], layout: ControlLayout, safe_deg: float
+    ) -> tuple[Float32[np.ndarray, "frames controls"], Float64[np.ndarray, " frames"]]:
+        """Controls that are known, as near as may be to those given; and how far answers can be believed, 0 to 1."""
+        found = controls.astype(np.float64)
+        for (_, part, moves), largest in zip(layout.parts, self.largest.astype(np.float64), strict=True):
+            if moves:
+                offset = found[:, part] - self.mean[part]
+                length = np.linalg.norm(offset, axis=1) / max(float(largest), 1e-9)
+                kept = np.where(length <= 1, 1.0, _fading(length, FADED) / np.maximum(length, 1.0))
+                found[:, part] = self.mean[part] + kept[:, None] * offset
+        columns = layout.pose_columns
+        turned = slice(0, 6 * len(layout.joints))
+        anchors, distances = _nearest_points(found[:, columns], self.poses.astype(np.float64), turned)
+        offset = found[:, columns] - anchors
+        apart = _degrees(offset[:, turned])
+        inward = np.minimum(1.0, safe_deg / np.maximum(apart, 1e-9))
+        found[:, columns] = anchors + inward[:, None] * offset
+        return found.astype(np.float32), _fading(distances / safe_deg, FADED_POSES)
+
+
+def _fading(times: Float[np.ndarray, " frames"], gone: float) -> Float64[np.ndarray, " frames"]:
+    """1 up to 1, then smoothly down to 0."""
+    beyond = np.clip((np.asarray(times, np.float64) - 1) / (gone - 1), 0, 1)
+    return 1 - beyond**2 * (3 - 2 * beyond)
+
+
+def _degrees(offsets: Float64[np.ndarray, "frames rotations"]) -> Float64[np.ndarray, " frames"]:
+    """Root mean square angle of differences of rotations, 6 numbers a joint."""
+    joints = max(offsets.shape[1] // 6, 1)
+    return np.degrees(np.linalg.norm(offsets, axis=1) / np.sqrt(joints) / NUMBERS_OF_A_RADIAN)
+
+
+def _nearest_points(
+    poses: Float64[np.ndarray, "frames poses"], learned: Float64[np.ndarray, "learned poses"], turned: slice
+) -> tuple[Float64[np.ndarray, "frames poses"], Float64[np.ndarray, " frames"]]:
+    """For each pose a point amid the learned ones that are nearest, and the degrees to the very nearest."""
+    if not len(learned) or not poses.shape[1]:
+        return poses.copy(), np.zeros(len(poses))
+    points, nearest = np.empty_like(poses), np.empty(len(poses))
+    size = max(1, PAIRS // max(len(learned) * learned[:, turned].shape[1], 1))
+    for start in range(0, len(poses), size):
+        part = slice(start, start + size)
+        squares = (
+            (poses[part, turned] ** 2).sum(axis=1)[:, None]
+            + (learned[:, turned] ** 2).sum(axis=1)
+            - 2 * poses[part, turned] @ learned[:, turned].T
+        )
+        apart = np.sqrt(np.maximum(squares, 0.0))
+        least = apart.min(axis=1)
+        weights = np.exp(-((apart - least[:, None]) / np.maximum(NEAREST_SHARE * least, 1e-6)[:, None]))
+        points[part] = weights @ learned / weights.sum(axis=1, keepdims=True)
+        joints = max(learned[:, turned].shape[1] // 6, 1)
+        nearest[part] = np.degrees(least / np.sqrt(joints) / NUMBERS_OF_A_RADIAN)
+    return points, nearest
+
+
+# --- coefficients ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CoefficientRange:
+    """The coefficients of the learned frames: an ellipsoid, and a box around it."""
+
+    std: Float32[np.ndarray, " shapes"]
+    largest: Float32[np.ndarray, " shapes"]
+    """Of each coefficient's size."""
+    length: float
+    """The largest length of a frame's coefficients, each over its standard deviation."""
+
+    @staticmethod
+    def of(clips: Sequence[Clip], std: Float[np.ndarray, " shapes"]) -> CoefficientRange:
+        """
+        Raises:
+            InputError: there are not two good frames.
+        """
+        known = good_frames(clips)[1].astype(np.float64)
+        whole = np.maximum(np.asarray(std, np.float64), 1e-6 * float(np.max(std, initial=1e-6)))
+        lengths = np.linalg.norm(known / whole, axis=1)
+        return CoefficientRange(
+            whole.astype(np.float32), np.abs(known).max(axis=0).astype(np.float32), float(lengths.max())
+        )
+
+    def inside(self, coefficients: Float[np.ndarray, "frames shapes"]) -> Float32[np.ndarray, "frames shapes"]:
+        """Coefficients in the box, drawn together into the ellipsoid."""
+        found = np.clip(coefficients, -self.largest, self.largest)
+        lengths = np.linalg.norm(found / self.std, axis=1)
+        return (found * np.minimum(1.0, self.length / np.maximum(lengths, 1e-9))[:, None]).astype(np.float32)
+
+
+# --- regressors --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BoundedRegressor:
+    """A regressor that is asked about what it knows, and believed as far as that goes."""
+
+    regressor: Regressor
+    controls: ControlRange
+    coefficients: CoefficientRange
+    safe_deg: float
+
+    @property
+    def layout(self) -> ControlLayout:
+        return self.regressor.layout
+
+    def stream(self) -> BoundedStream:
+        return BoundedStream(self)
+
+    def predict(self, controls: Float32[np.ndarray, "frames controls"]) -> Float32[np.ndarray, "frames shapes"]:
+        known, trust = self.controls.bounded(controls, self.layout, self.safe_deg)
+        return self.believed(self.regressor.predict(known), trust)
+
+    def believed(
+        self, answers: Float32[np.ndarray, "frames shapes"], trust: Float64[np.ndarray, " frames"]
+    ) -> Float32[np.ndarray, "frames shapes"]:
+        """Answers within what was learned, faded towards the mean garment."""
+        return self.coefficients.inside(trust[:, None] * answers)
+
+
+class BoundedStream:
+    """A motion that is answered frame by frame."""
+
+    def __init__(self, regressor: BoundedRegressor) -> None:
+        self._regressor, self._inner = regressor, regressor.regressor.stream()
+
+    def push(self, controls: Float[np.ndarray, " controls"]) -> Float32[np.ndarray, " shapes"]:
+        regressor = self._regressor
+        known, trust = regressor.controls.bounded(np.asarray(controls)[None], regressor.layout, regressor.safe_deg)
+        return regressor.believed(self._inner.push(known[0])[None], trust)[0]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KnownRange:
+    """All that a garment was learned from."""
+
+    poses: PoseRange
+    controls: Mapping[str, ControlRange]
+    """By the regressor that they drive; the network's are those of the linear regression."""
+    coefficients: CoefficientRange
+    stretch_p99: float
+    """Edge length over the mean garment's, 99th percentile, of the learned frame in which it is largest."""
+
+    @property
+    def safe_deg(self) -> float:
+        """How far from every learned pose a regressor is believed."""
+        return min(max(SAFE_DEG[0], self.poses.validated_deg), SAFE_DEG[1])
+
+    def bounded(self, name: str, regressor: Regressor) -> BoundedRegressor:
+        """A regressor of that name within what is known."""
+        controls = self.controls["kernel" if name == "kernel" else "linear"]
+        return BoundedRegressor(regressor, controls, self.coefficients, self.safe_deg)
+
+
+# --- files -------------------------------------------------------------------------------------------------------
+
+
+def save_known_range(path: Path, known: KnownRange, *, model_digest: str) -> None:
+    poses, coefficients = known.poses, known.coefficients
+    tensors = {"quaternions": poses.quaternions, "std": coefficients.std, "largest": coefficients.largest}
+    for name, controls in known.controls.items():
+        tensors |= {f"{name}.{part}": getattr(controls, part) for part in ("mean", "largest", "poses")}
+    note = {
+        "joints": list(poses.joints),
+        "validated_deg": poses.validated_deg,
+        "length": coefficients.length,
+        "stretch_p99": known.stretch_p99,
+        "controls": sorted(known.controls),
+        "model": model_digest,
+    }
+    write_tensors(path, _KIND, tensors, note)
+
+
+def load_known_range(path: Path, *, model_digest: str) -> KnownRange:
+    """Raises InputError: the file is damaged, another kind, or belongs to another model."""
+    file = read_tensors(path, _KIND)
+    if file.entry("model") != model_digest:
+        raise InputError("expected the range of the blendshapes beside it, found that of another model", where=path)
+    poses = PoseRange(
+        file["quaternions"], tuple(int(joint) for joint in file.entry("joints")), float(file.entry("validated_deg"))
+    )
+    controls = {
+        str(name): ControlRange(file[f"{name}.mean"], file[f"{name}.largest"], file[f"{name}.poses"])
+        for name in file.entry("controls")
+    }
+    coefficients = CoefficientRange(file["std"], file["largest"], float(file.entry("length")))
+    return KnownRange(poses, controls, coefficients, float(file.entry("stretch_p99")))
