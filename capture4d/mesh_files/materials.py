@@ -10,7 +10,6 @@ import os
 import re
 import unicodedata
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 import numpy as np
@@ -29,6 +28,7 @@ _ARGUMENTS = dict.fromkeys(
     ("-blendu", "-blendv", "-boost", "-bm", "-cc", "-clamp", "-colorspace", "-imfchan", "-texres", "-type"), 1
 ) | {"-mm": 2}
 """How many words follow an option of a map; -s, -o and -t have one to three numbers."""
+_MOST_LIBRARIES = 1000
 _UP_TO_THREE = ("-s", "-o", "-t")
 _WORD = re.compile(r"\s*(\S+)\s*")
 _QUOTED_OR_WORD = re.compile(r'"([^"]+)"|(\S+)')
@@ -68,20 +68,19 @@ def paint_at_vertices(path: Path, painted: Painted) -> tuple[UInt8[np.ndarray, "
     order = np.argsort(which, kind="stable")
     firsts = np.searchsorted(which[order], np.arange(len(materials) + 1))
 
-    @lru_cache(maxsize=1)
-    def picture(name: str) -> np.ndarray:
-        return read_picture(_first_there(path, _spellings(name), "texture"))
-
-    by_picture = sorted(range(len(materials)), key=lambda index: getattr(materials[index].texture, "name", ""))
-    for index in by_picture:
-        own = order[firsts[index] : firsts[index + 1]]
+    files: dict[Path, list[int]] = {}
+    for index in np.unique(which[which >= 0]).tolist():
         material = materials[index]
-        if not len(own) or (material.texture is not None and painted.uv is None):
-            continue
-        if material.texture is not None:
-            colours[own] = _sampled(picture(material.texture.name), material.texture, painted.uv[own])
-        elif material.colour is not None:
-            colours[own] = 255 * np.array(material.colour)
+        if material.texture is None:
+            colours[order[firsts[index] : firsts[index + 1]]] = 255 * np.array(material.colour or np.nan)
+        elif painted.uv is not None:
+            files.setdefault(_first_there(path, _spellings(material.texture.name), "texture"), []).append(index)
+    for file, indices in files.items():
+        picture = read_picture(file)
+        for index in indices:
+            own, texture = order[firsts[index] : firsts[index + 1]], materials[index].texture
+            if texture is not None and painted.uv is not None:
+                colours[own] = _sampled(picture, texture, painted.uv[own])
     known = np.isfinite(colours).all(axis=2)
     if not known.any():
         return None, notes
@@ -147,6 +146,8 @@ def _read_libraries(path: Path, names: tuple[str, ...]) -> tuple[dict[str, Mater
 
     What stands behind `mtllib` is one name with spaces in it, or several names.
     """
+    if len(names) > _MOST_LIBRARIES:
+        raise InputError(f"expected at most {_MOST_LIBRARIES} files of materials, found {len(names)}")
     known: dict[str, Material] = {}
     missing = None
     for text in names:

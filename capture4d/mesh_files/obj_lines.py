@@ -29,8 +29,12 @@ _MOST = 2**31 - 1
 """What our own indices can count."""
 _SPACE, _SLASH = 32, 47
 _COMMENT_BEHIND = re.compile(rb"^((?:vt|[vf])[ \t\v\f\\][^\n#]*)#[^\n]*", re.MULTILINE | re.IGNORECASE)
-_COMMENT_OR_CONTINUED = re.compile(rb"^#[^\n]*|\\[ \t\v\f]*\n", re.MULTILINE)
-_CONTINUED_COMMENT = re.compile(rb"[^\n]#[^\n]*\\[ \t\v\f]*$", re.MULTILINE)
+_BREAK = re.compile(rb"\\[ \t\v\f]*\n")
+_CONTINUED = re.compile(
+    rb"^(?:vt|[vf])(?=[ \t\v\f\\])[^\n\\]*(?:\\[ \t\v\f]*\n[^\n\\]*)+", re.MULTILINE | re.IGNORECASE
+)
+"""A line of numbers that goes on in the next. Names do not: one that ends in a backslash would swallow a vertex."""
+_CONTINUED_COMMENT = re.compile(rb"(?:^[^\n#]+|\\[ \t\v\f]*\n[ \t\v\f]*)#[^\n]*\\[ \t\v\f]*$", re.MULTILINE)
 _NUMERIC = (b"v", b"vt", b"f")
 
 
@@ -39,7 +43,7 @@ class Names:
 
     def __init__(self) -> None:
         self.materials: list[bytes] = []
-        self.libraries: list[bytes] = []
+        self.libraries: dict[bytes, None] = {}
         self.current = -1
         self._places: dict[bytes, int] = {}
 
@@ -50,8 +54,8 @@ class Names:
         if keyword.lower() == b"usemtl":
             self.current = self._places.setdefault(name, len(self.materials)) if name else -1
             self.materials += [name] if self.current == len(self.materials) else []
-        elif keyword.lower() == b"mtllib" and name and name not in self.libraries:
-            self.libraries.append(name)
+        elif keyword.lower() == b"mtllib" and name:
+            self.libraries[name] = None
         return self.current
 
 
@@ -80,8 +84,8 @@ def at_once(text: bytes) -> Tables | None:
     if b"\\" in text:
         if _CONTINUED_COMMENT.search(text):
             return None
-        text = _COMMENT_OR_CONTINUED.sub(lambda found: found[0] if found[0].startswith(b"#") else b" ", text)
-        text = _without_comments(without_indents(text if text.endswith(b"\n") else text + b"\n"))
+        text = _CONTINUED.sub(lambda found: _BREAK.sub(b" ", found[0]), text)
+        text = _without_comments(text if text.endswith(b"\n") else text + b"\n")
     lines = TextLines(text)
     first, second, third = (lines.letters(place) for place in range(3))
     is_v = (first == ord("v")) & (second <= _SPACE)
@@ -218,15 +222,13 @@ def _logical_lines(text: bytes) -> Iterator[tuple[int, bytes]]:
     first = 0
     for number_of_line, line in enumerate(text.split(b"\n"), start=1):
         piece = line.strip(BLANKS)
-        comment = piece.startswith(b"#")
-        if not waiting:
-            first = number_of_line
+        first = first if waiting else number_of_line
         words = (waiting[0] if waiting else piece).replace(b"\\", b" ").split(None, 1)
         if words and words[0].lower() in _NUMERIC:
             piece = piece.partition(b"#")[0].rstrip(BLANKS)
-        if piece.endswith(b"\\") and not comment:
-            waiting.append(piece[:-1] + b" ")
-            continue
+            if piece.endswith(b"\\"):
+                waiting.append(piece[:-1] + b" ")
+                continue
         whole = b"".join([*waiting, piece])
         waiting = []
         if whole.strip(BLANKS) and not whole.lstrip(BLANKS).startswith(b"#"):

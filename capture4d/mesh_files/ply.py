@@ -109,27 +109,28 @@ def _header(data: bytes) -> _Header:
         raise InputError("not a PLY file, expected it to begin with 'ply'")
     if end is None:
         raise InputError("cut off in the header")
-    elements: list[Element] = []
-    order, images = None, []
+    elements: dict[str, Element] = {}
+    latest: Element | None = None
+    order, images = None, {}
     for line in lines[1:]:
         try:
             match line.split():
                 case ["format", name, *_]:
                     order = _ORDERS[name.lower()]
                 case ["element", name, count]:
-                    if any(name == element.name for element in elements) or not re.fullmatch(r"[0-9]{1,15}", count):
+                    if name in elements or not re.fullmatch(r"[0-9]{1,15}", count):
                         raise ValueError(name)
-                    elements.append(Element(name, int(count)))
-                case ["property", "list", length, kind, name]:
-                    elements[-1].add(name, _TYPES[kind.lower()], _TYPES[length.lower()])
-                case ["property", kind, name]:
-                    elements[-1].add(name, _TYPES[kind.lower()], "")
+                    latest = elements[name] = Element(name, int(count))
+                case ["property", "list", length, kind, name] if latest is not None:
+                    latest.add(name, _TYPES[kind.lower()], _TYPES[length.lower()])
+                case ["property", kind, name] if latest is not None:
+                    latest.add(name, _TYPES[kind.lower()], "")
                 case ["format" | "element" | "property", *_]:
                     raise ValueError(line)
-        except (KeyError, ValueError, IndexError):
+        except (KeyError, ValueError):
             raise InputError(f"damaged header, cannot read '{line.strip()[:80]}'") from None
-        named = _TEXTURE.fullmatch(line.strip())
-        images += [named[1]] if named and named[1] not in images else []
+        if named := _TEXTURE.fullmatch(line.strip()):
+            images[named[1]] = None
     if order is None or not elements:
         raise InputError("cut off in the header")
     size = end.end()
@@ -137,7 +138,7 @@ def _header(data: bytes) -> _Header:
         rb"[^\r\n]*\r[^\n]", data
     ):  # lines end with \r: the rest is the first byte behind
         size -= 1
-    return _Header(elements, order, tuple(images), len(lines) + 1, size)
+    return _Header(list(elements.values()), order, tuple(images), len(lines) + 1, size)
 
 
 def _element(elements: list[Element], name: str) -> Element:

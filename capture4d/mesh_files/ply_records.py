@@ -35,10 +35,12 @@ class Element:
     """Name, type, and for a list the type of its length, else ''."""
     values: dict[str, np.ndarray] = field(default_factory=dict)
     lists: dict[str, Lists] = field(default_factory=dict)
+    _names: set[str] = field(default_factory=set)
 
     def add(self, name: str, kind: str, length: str) -> None:
-        if any(name == other for other, _, _ in self.properties) or length.startswith("f"):
+        if name in self._names or length.startswith("f"):
             raise ValueError(name)
+        self._names.add(name)
         self.properties.append((name, kind, length))
 
     def keep(self, name: str, flat: np.ndarray, sizes: np.ndarray | None) -> None:
