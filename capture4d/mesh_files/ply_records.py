@@ -14,6 +14,7 @@ __all__ = ["COLOURS", "Element", "Lists", "read_binary", "read_text"]
 
 COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 """What the channels of a colour are called."""
+_LETTERS = {"i1": "b", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "i8": "q", "u8": "Q"}
 _CHANNELS = {channel for channels in COLOURS for channel in channels}
 
 
@@ -124,7 +125,7 @@ def _walked(
     plan, skipped = [], 0
     for _, kind, length in element.properties:
         if length:
-            unpack = None if length == "u1" else struct.Struct(order + np.dtype(length).char).unpack_from
+            unpack = None if length == "u1" else struct.Struct(order + _LETTERS[length]).unpack_from
             plan.append((skipped, unpack, np.dtype(length).itemsize, np.dtype(kind).itemsize))
             skipped = 0
         else:
@@ -234,7 +235,7 @@ def _as_stream(elements: list[Element], numbers: np.ndarray) -> bool:
             for column, (_, _, length) in zip(columns, element.properties, strict=True):
                 entries = 1
                 if length and offset < len(numbers):
-                    entries = int(numbers[offset]) if 0 <= numbers[offset] <= len(numbers) else len(numbers)
+                    entries = int(numbers[offset]) if numbers[offset] in range(len(numbers)) else len(numbers)
                     offset += 1
                 column.append(numbers[offset : offset + entries])
                 offset += entries

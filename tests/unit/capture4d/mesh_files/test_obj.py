@@ -88,7 +88,9 @@ SPELLINGS: dict[str, str | bytes] = {
     "a group that ends in a backslash": PLAIN.replace("\nf", "\ng C:\\a\\\nf"),
     "a material with a sign": PLAIN.replace("\nf", "\nusemtl mat#1\nf"),
     "a name in latin-1": ("o Größe\n" + PLAIN).encode("latin-1"),
-    "exponents": each(lambda line: " ".join(word if word == "v" else f"{float(word):.5e}" for word in line.split()), "v"),
+    "exponents": each(
+        lambda line: " ".join(word if word == "v" else f"{float(word):.5e}" for word in line.split()), "v"
+    ),
     "signs": each(lambda line: line.replace(" ", " +"), "v vt"),
     "a weight": each(lambda line: f"{line} 1.0", "v"),
     "a third texture coordinate": each(lambda line: f"{line} 0.0", "vt"),
@@ -163,7 +165,9 @@ def test_colours_are_scaled_by_what_most_of_them_are(text: str, expected: np.nda
     np.testing.assert_array_equal(found.mesh.vertices, POINTS.astype(np.float32))
 
 
-@pytest.mark.parametrize("spelled", ["nan nan nan", "1 nan 0", "-nan(ind) 0 0", "1.#QNAN 0 0", "inf 0 0", "0 -1.#IND 0"])
+@pytest.mark.parametrize(
+    "spelled", ["nan nan nan", "1 nan 0", "-nan(ind) 0 0", "1.#QNAN 0 0", "inf 0 0", "0 -1.#IND 0"]
+)
 def test_a_colour_that_is_no_number_costs_itself(spelled: str, tmp_path: Path):
     lines = coloured(UNIT).split("\n")
     lines[5] = " ".join([*V[5].split(), spelled])
