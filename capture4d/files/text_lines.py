@@ -33,7 +33,9 @@ _NEWLINE, _SPACE = 10, 32
 _INDENT = re.compile(rb"^[ \t\v\f]+", re.MULTILINE)
 _NOT_NUMBERS = re.compile(rb"(?<![^\s])[+-]?1[.,]#(?:QNAN|SNAN|IND|INF)\w*", re.IGNORECASE)
 """How older Windows programs print what is no number."""
-_NUMBER = re.compile(rb"[+-]?(?:(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?|nan(?:\([\w-]*\))?|inf(?:inity)?)", re.IGNORECASE)
+_NUMBER = re.compile(
+    rb"[+-]?(?:(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?|nan(?:\([\w-]*\))?|inf(?:inity)?)", re.IGNORECASE
+)
 
 
 def plain_text(data: bytes) -> bytes:

@@ -123,7 +123,8 @@ def _materials_of(
             raise InputError(f"expected usemtl lines, for there are {len(chosen)} materials, found none")
         return chosen, np.full(count, len(chosen) - 1), notes
     used = [painted.names[index] for index in np.unique(paint[paint >= 0])]
-    found = {name: _looked_up(known, name) for name in used}
+    folded = {name.casefold(): material for name, material in known.items()}
+    found = {name: _looked_up(known, folded, name) for name in used}
     unknown = sorted(name for name, material in found.items() if material is None)
     if unknown and missing is not None:
         raise missing
@@ -131,11 +132,13 @@ def _materials_of(
     return [found.get(name) or Material() for name in painted.names], paint, notes
 
 
-def _looked_up(known: dict[str, Material], name: str) -> Material | None:
+def _looked_up(known: dict[str, Material], folded: dict[str, Material], name: str) -> Material | None:
+    """The material of a name, of that name in another case, or of the name without a comment behind it."""
     bare = name.partition(" #")[0].strip()
-    if name in known or bare in known:
-        return known.get(name) or known[bare]
-    return next((material for other, material in known.items() if other.casefold() == name.casefold()), None)
+    for each in (name, bare):
+        if each in known or each.casefold() in folded:
+            return known.get(each) or folded[each.casefold()]
+    return None
 
 
 # --- mtl files -------------------------------------------------------------------------------------------------------

@@ -235,7 +235,7 @@ def _as_stream(elements: list[Element], numbers: np.ndarray) -> bool:
             for column, (_, _, length) in zip(columns, element.properties, strict=True):
                 entries = 1
                 if length and offset < len(numbers):
-                    entries = int(numbers[offset]) if numbers[offset] in range(len(numbers)) else len(numbers)
+                    entries = _entries(numbers[offset], len(numbers))
                     offset += 1
                 column.append(numbers[offset : offset + entries])
                 offset += entries
@@ -248,6 +248,11 @@ def _as_stream(elements: list[Element], numbers: np.ndarray) -> bool:
                 return False
             element.keep(name, typed, np.array([len(each) for each in column], np.int64) if length else None)
     return offset == len(numbers)
+
+
+def _entries(number: float, most: int) -> int:
+    """The length of a list; what none can be is the most there could be, and too many."""
+    return int(number) if 0 <= number <= most and number == int(number) else most
 
 
 def _typed(numbers: np.ndarray, kind: str, name: str) -> tuple[np.ndarray, int | None]:
