@@ -177,6 +177,8 @@ def without_indents(text: bytes) -> bytes:
 
 def parsed(text: bytes, dtype: type) -> np.ndarray | None:
     """The numbers of a text; None if there is anything else. Two that touch, as in 1.5-2, are two."""
+    if not text or text.isspace():  # of which numpy makes -1
+        return np.zeros(0, dtype)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         try:

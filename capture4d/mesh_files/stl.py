@@ -57,7 +57,8 @@ def _is_binary(data: bytes) -> bool:
     """Some binary files begin with 'solid', which should tell texts."""
     if len(data) >= _HEAD and len(data) == _HEAD + _RECORD.itemsize * int.from_bytes(data[80:84], "little"):
         return True
-    return data[:512].lstrip()[:5].lower() != b"solid" or b"\0" in data[:512]
+    head = data[:512].removeprefix(b"\xef\xbb\xbf").lstrip()
+    return head[:5].lower() != b"solid" or b"\0" in head
 
 
 def _binary(data: bytes) -> np.ndarray:
@@ -85,6 +86,7 @@ def _text(data: bytes) -> np.ndarray:
     if whole < len(kept) or not (ends & (fourth == ord("s")))[filled[-1]]:
         raise InputError(f"cut off, expected 'endsolid' in the end, after {whole // 7} whole triangles")
     vertex = kept[first[kept] == ord("v")]
-    if not (lines.letters(5)[vertex] == ord("x")).all():
-        raise InputError("expected lines of 'vertex x y z', found others")
+    wrong = vertex[(lines.letters(1)[vertex] != ord("e")) | (lines.letters(5)[vertex] != ord("x"))]
+    if len(wrong):
+        raise lines.fault(int(wrong[0]), "expected a line of 'vertex x y z', found another")
     return lines.needed(vertex, 3, keyword=6).columns(3).astype(np.float32)

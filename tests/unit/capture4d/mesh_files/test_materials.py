@@ -1,4 +1,4 @@
-"""Materials and textures beside a mesh, as exporters name them: every face has its own paint, or one line says why not."""
+"""Materials and textures as exporters name them: every face has its own paint, or one line says why not."""
 
 import re
 from pathlib import Path
@@ -137,8 +137,15 @@ def test_names_of_files_below(name: str, folder: Path):
     assert colours(folder, obj("usemtl a"), f"newmtl a\nmap_Kd {name}\n") == [BLUE]
 
 
-LIBRARIES = ["mtllib a.mtl b.mtl", "mtllib a.mtl\nmtllib b.mtl", 'mtllib "a.mtl" "b.mtl"', "mtllib A.MTL b.mtl",
-             "mtllib a.mtl b.mtl missing.mtl", "mtllib missing.mtl\nmtllib b.mtl a.mtl", "MTLLIB .\\a.mtl\nmtllib b.mtl"]  # fmt: skip
+LIBRARIES = [
+    "mtllib a.mtl b.mtl",
+    "mtllib a.mtl\nmtllib b.mtl",
+    'mtllib "a.mtl" "b.mtl"',
+    "mtllib A.MTL b.mtl",
+    "mtllib a.mtl b.mtl missing.mtl",
+    "mtllib missing.mtl\nmtllib b.mtl a.mtl",
+    "MTLLIB .\\a.mtl\nmtllib b.mtl",
+]
 
 
 @pytest.mark.parametrize("library", LIBRARIES)
@@ -288,7 +295,7 @@ def test_options_alone_name_nothing(tmp_path: Path):
     assert found["a"].texture.name == "1", "a file may be called so"
 
 
-# --- ply ---------------------------------------------------------------------------------------------------------------
+# --- ply -------------------------------------------------------------------------------------------------------------
 
 
 def ply(images: list[str], numbers: list[int] | None, *, uv: bool = True, comment: str = "comment TextureFile") -> str:
