@@ -130,6 +130,11 @@ def _walked(
             skipped = 0
         else:
             skipped += np.dtype(kind).itemsize
+    least = skipped + sum(before + width for before, _, width, _ in plan)
+    if least * element.count > len(body) - offset:
+        raise InputError(
+            f"cut off, expected {element.count} records of '{element.name}', found {len(body) - offset} bytes"
+        )
     begins: list[int] = []
     starts: list[int] = []
     sizes: list[int] = []
@@ -230,17 +235,10 @@ def _as_stream(elements: list[Element], numbers: np.ndarray) -> bool:
     """Read numbers whatever lines they stand in; whether they are exactly as many as there have to be."""
     offset = 0
     for element in elements:
-        columns: list[list[np.ndarray]] = [[] for _ in element.properties]
-        for _ in range(element.count if element.properties else 0):
-            for column, (_, _, length) in zip(columns, element.properties, strict=True):
-                entries = 1
-                if length and offset < len(numbers):
-                    entries = _entries(numbers[offset], len(numbers))
-                    offset += 1
-                column.append(numbers[offset : offset + entries])
-                offset += entries
-                if offset > len(numbers):
-                    return False
+        found = _streamed(element, numbers, offset)
+        if found is None:
+            return False
+        columns, offset = found
         for column, (name, kind, length) in zip(columns, element.properties, strict=True):
             flat = np.concatenate([*column, np.zeros(0)])
             typed, wrong = _typed(flat, kind, name)
@@ -248,6 +246,31 @@ def _as_stream(elements: list[Element], numbers: np.ndarray) -> bool:
                 return False
             element.keep(name, typed, np.array([len(each) for each in column], np.int64) if length else None)
     return offset == len(numbers)
+
+
+def _streamed(element: Element, numbers: np.ndarray, offset: int) -> tuple[list[list[np.ndarray]], int] | None:
+    """The columns of an element, in pieces, and the place behind it; None if there are too few numbers."""
+    width = len(element.properties)
+    if not any(length for _, _, length in element.properties):
+        table = numbers[offset : offset + width * element.count]
+        whole = len(table) == width * element.count
+        return (
+            ([[column] for column in table.reshape(-1, max(width, 1)).T[:width]], offset + len(table))
+            if whole
+            else None
+        )
+    columns: list[list[np.ndarray]] = [[] for _ in element.properties]
+    for _ in range(element.count):
+        for column, (_, _, length) in zip(columns, element.properties, strict=True):
+            entries = 1
+            if length and offset < len(numbers):
+                entries = _entries(numbers[offset], len(numbers))
+                offset += 1
+            column.append(numbers[offset : offset + entries])
+            offset += entries
+            if offset > len(numbers):
+                return None
+    return columns, offset
 
 
 def _entries(number: float, most: int) -> int:
