@@ -3,7 +3,7 @@
     python examples/01_own_scans_to_a_capture.py SCANS TEMPLATE.obj CAPTURE --garment 2f62c9 --paint ffc400
     capture4d run CAPTURE --output WORK
 
-SCANS holds one mesh with vertex colours per frame (ply, obj or glb, metres, Y up), named by frame number or in the
+SCANS holds one mesh with vertex colours per frame (ply, obj, glb or off, metres, Y up), named by frame number or in the
 order of their names. Without a body the template has to lie roughly on the first scan.
 """
 

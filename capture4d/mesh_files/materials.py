@@ -63,6 +63,8 @@ def paint_at_vertices(path: Path, painted: Painted) -> tuple[UInt8[np.ndarray, "
         InputError: a file that a face needs is missing, damaged, or lies elsewhere.
     """
     materials, which, notes = _materials_of(path, painted)
+    if not materials:
+        return None, notes
     faces = painted.found.mesh.faces
     colours = np.full((len(faces), 3, 3), np.nan)
     order = np.argsort(which, kind="stable")
@@ -149,26 +151,36 @@ def _read_libraries(path: Path, names: tuple[str, ...]) -> tuple[dict[str, Mater
 
     What stands behind `mtllib` is one name with spaces in it, or several names.
     """
-    if len(names) > _MOST_LIBRARIES:
-        raise InputError(f"expected at most {_MOST_LIBRARIES} files of materials, found {len(names)}")
+    words_of = {
+        text: list(dict.fromkeys(quoted or word for quoted, word in _QUOTED_OR_WORD.findall(text))) for text in names
+    }
+    count = sum(len(words) for words in words_of.values())
+    if count > _MOST_LIBRARIES:
+        raise InputError(f"expected at most {_MOST_LIBRARIES} files of materials, found {count}")
     known: dict[str, Material] = {}
     missing = None
-    for text in names:
-        words = [quoted or word for quoted, word in _QUOTED_OR_WORD.findall(text)]
-        try:
-            files = [_first_there(path, _spellings(text), "materials")]
-        except InputError as error:
-            missing, files = missing or error, []
-            if len(words) > 1:
-                for word in words:
-                    try:
-                        files.append(companion_anyhow(path, word, "materials"))
-                    except InputError as other:
-                        missing = other
-                missing = missing if len(files) < len(words) else None
+    for text, words in words_of.items():
+        files, fault = _library_files(path, text, words)
+        missing = missing or fault
         for file in files:
             known = read_materials(file) | known
     return known, missing
+
+
+def _library_files(path: Path, text: str, words: list[str]) -> tuple[list[Path], InputError | None]:
+    """The files of one line that are there, and the fault of the first that is not."""
+    try:
+        return [_first_there(path, _spellings(text), "materials")], None
+    except InputError as error:
+        if len(words) == 1:
+            return [], error
+    files, missing = [], None
+    for word in words:
+        try:
+            files.append(companion_anyhow(path, word, "materials"))
+        except InputError as error:
+            missing = missing or error
+    return files, missing
 
 
 def read_materials(path: Path) -> dict[str, Material]:

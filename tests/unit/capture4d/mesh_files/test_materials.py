@@ -246,6 +246,8 @@ def test_textures_need_uvs(folder: Path):
         (obj("usemtl a"), "newmtl a\nmap_Kd r.png".encode("utf-16"), "x.mtl: expected UTF-8, found UTF-16 text"),
         (obj(""), TWO, "x.obj: expected usemtl lines, for there are 2 materials, found none"),
         (obj("usemtl a", library="\n".join(f"mtllib {n}.mtl" for n in range(2000))), None, "at most 1000 files"),
+        (obj("usemtl a", library="mtllib " + " ".join(map(str, range(2000)))), None, "at most 1000 files"),
+        (obj("usemtl c", library="mtllib no.mtl\nmtllib x.mtl x.mtl"), TWO, "no.mtl: no such file, the materials"),
     ],
 )
 def test_what_a_face_needs_and_is_not_there_is_one_line(
