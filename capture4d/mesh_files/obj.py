@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from capture4d.errors import InputError
 from capture4d.files.text_lines import Numbers, plain_text
 from capture4d.mesh_files.materials import decoded
 from capture4d.mesh_files.obj_lines import Tables, at_once, line_by_line
@@ -18,6 +19,9 @@ from capture4d.mesh_files.polygons import Painted, colour_bytes, polygon_corners
 from capture4d.types import Mesh
 
 __all__ = ["obj_bytes", "read_obj"]
+
+_KEYWORDS = b"vt vn vp o g s mg mtllib usemtl maplib usemap p l cstype deg lod bevel c_interp d_interp".split()
+"""What an OBJ without vertices and faces may begin with."""
 
 
 def read_obj(path: Path) -> Painted:
@@ -28,7 +32,21 @@ def read_obj(path: Path) -> Painted:
     """
     text = plain_text(path.read_bytes())
     tables = at_once(text)
-    return _assembled(line_by_line(text) if tables is None else tables)
+    if tables is None:
+        tables = line_by_line(text)
+    if not len(tables.vertices.counts) and not len(tables.sizes):
+        _require_keyword(text)
+    return _assembled(tables)
+
+
+def _require_keyword(text: bytes) -> None:
+    """A file without a mesh is an empty one if its first line is one of an OBJ, and else something else."""
+    for number, line in enumerate(text.split(b"\n"), start=1):
+        words = line.split(None, 1)
+        if words and not words[0].startswith(b"#"):
+            if words[0].lower() not in _KEYWORDS:
+                raise InputError(f"not an OBJ file, found '{decoded(line[:40])}'", line=number)
+            return
 
 
 def _assembled(tables: Tables) -> Painted:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 
 from capture4d.errors import InputError
@@ -33,7 +34,8 @@ def obj(*faces: str, library: str = "mtllib x.mtl", texture: bool = True) -> str
     for index, before in enumerate(faces):
         lines += [f"v {index} 0 0", f"v {index} 1 0", f"v {index} 0 1", "vt 0.1 0.2", "vt 0.9 0.2", "vt 0.1 0.8"]
         lines += [line for line in before.split("\n") if line]
-        lines.append("f -3/-3 -2/-2 -1/-1" if texture else "f -3 -2 -1")
+        corners = range(3 * index + 1, 3 * index + 4)
+        lines.append("f " + " ".join(f"{corner}/{corner}" if texture else f"{corner}" for corner in corners))
     return "\n".join(lines) + "\n"
 
 
@@ -69,6 +71,28 @@ def test_a_vertex_between_two_materials_has_the_mean(folder: Path):
     assert found is not None
     between = tuple(np.rint((np.array(RED) + GREEN) / 2).astype(int).tolist())
     assert [tuple(row) for row in found.tolist()] == [RED, between, between, GREEN]
+
+
+def test_trimesh_agrees_about_which_face_has_which_texture(tmp_path: Path):
+    """It makes a mesh of each material, with the picture that it read."""
+    rng = np.random.default_rng(3)
+    paints = rng.integers(0, 256, (6, 3))
+    for index, paint in enumerate(paints.tolist()):
+        picture(tmp_path / f"t {index}.png", (paint[0], paint[1], paint[2]))
+    (tmp_path / "x.mtl").write_text("".join(f"newmtl m{index}\nmap_Kd t {index}.png\n" for index in range(6)))
+    (tmp_path / "x.obj").write_text(obj(*(f"usemtl m{index}" for index in rng.integers(0, 6, 40))))
+    found = read_coloured_mesh(tmp_path / "x.obj")
+    assert found.colours is not None
+    ours = {
+        tuple(np.sort(found.mesh.vertices[face], axis=0).ravel().tolist()): found.colours[face[0]].tolist()
+        for face in found.mesh.faces
+    }
+    theirs = {}
+    for mesh in trimesh.load(tmp_path / "x.obj", process=False, force="scene").geometry.values():
+        paint = list(mesh.visual.material.image.convert("RGB").getpixel((0, 0)))
+        theirs |= {tuple(np.sort(triangle, axis=0).ravel().tolist()): paint for triangle in mesh.triangles}
+    assert len(ours) == 40
+    assert ours == theirs
 
 
 ONE_NAME = {

@@ -223,6 +223,10 @@ THREE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
         (THREE + "f -4 -2 -1\n", "x.obj:4: expected an index from 1, or from -1 down to -3, found -4"),
         (THREE + "f 1 2 2147483648\n", "x.obj:4: expected an index of at most 2147483647"),
         (THREE + "f 1 2 ٣\n", "x.obj:4: expected an index"),
+        ("<html>\n<body>404</body>\n", "x.obj:1: not an OBJ file, found '<html>'"),
+        ("# v\n\nply\nformat ascii 1.0\n", "x.obj:3: not an OBJ file, found 'ply'"),
+        (b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + bytes(range(256)), "x.obj:1: not an OBJ file"),
+        ("version https://git-lfs.github.com/spec/v1\n", "x.obj:1: not an OBJ file"),
         ("v 1" + "1" * 100_000 + "x 0 0\n", "x.obj:1: expected numbers"),
     ],
 )
@@ -240,6 +244,6 @@ def test_a_cloud_of_points_is_read_where_no_faces_are_needed(tmp_path: Path):
     np.testing.assert_array_equal(found.colours, BYTES)
     with pytest.raises(InputError, match="empty mesh, found 12 vertices and no faces"):
         read_mesh(tmp_path / "x.obj")
-    (tmp_path / "x.obj").write_text("# nothing\n")
+    (tmp_path / "x.obj").write_text("# nothing\n\nmtllib x.mtl\no nothing\n")
     with pytest.raises(InputError, match="empty mesh, found 0 vertices"):
         read_mesh(tmp_path / "x.obj", faces_needed=False)
