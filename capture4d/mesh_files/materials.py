@@ -11,6 +11,7 @@ import re
 import unicodedata
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
+from urllib.parse import unquote
 
 import numpy as np
 from jaxtyping import Float64, Integer, UInt8
@@ -257,9 +258,9 @@ def decoded(text: bytes) -> str:
 
 
 def _spellings(text: str) -> list[str]:
-    """What a name may be that stands at the end of a line: all of it; without quotes; without a comment behind."""
+    """What a name may be that stands at the end of a line: all of it; without quotes, a comment behind, or escapes."""
     bare = text.partition(" #")[0].strip()
-    return list(dict.fromkeys([text, text.strip("\"'"), bare, bare.strip("\"'")]))
+    return list(dict.fromkeys([text, text.strip("\"'"), bare, bare.strip("\"'"), unquote(text)]))
 
 
 def _first_there(path: Path, names: list[str], what: str) -> Path:
