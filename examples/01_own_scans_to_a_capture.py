@@ -3,7 +3,7 @@
     python examples/01_own_scans_to_a_capture.py SCANS TEMPLATE.obj CAPTURE --garment 2f62c9 --paint ffc400
     capture4d run CAPTURE --output WORK
 
-SCANS holds one mesh with vertex colours per frame (ply, obj or glb, metres, Y up), named by frame number or in the
+SCANS holds one mesh with vertex colours per frame (ply, obj, glb or off, metres, Y up), named by frame number or in the
 order of their names. Without a body the template has to lie roughly on the first scan.
 """
 
@@ -18,7 +18,7 @@ from capture4d.captures.capture import Capture, write_capture_description
 from capture4d.colours.spaces import parse_colour
 from capture4d.files.records import save_garment
 from capture4d.geometry.mesh import boundary_loops
-from capture4d.mesh_files.meshes import MESH_SUFFIXES, read_mesh
+from capture4d.mesh_files.meshes import READABLE, read_mesh
 from capture4d.types import Garment
 
 
@@ -32,7 +32,7 @@ def main() -> None:
     parser.add_argument("--fps", type=float, default=60.0)
     options = parser.parse_args()
 
-    files = sorted(path for path in options.scans.iterdir() if path.suffix.lower() in MESH_SUFFIXES)
+    files = sorted(path for path in options.scans.iterdir() if path.suffix.lower() in READABLE)
     numbers = [re.findall(r"\d+", path.stem) for path in files]
     frame_ids = [int(found[-1]) for found in numbers] if all(numbers) else list(range(1, len(files) + 1))
     (options.capture / "scans").mkdir(parents=True, exist_ok=True)

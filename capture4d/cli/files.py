@@ -22,7 +22,7 @@ class Template:
     """Make a template of your own garment mesh, or of a part of the body: bound, its borders named, its UVs checked."""
 
     mesh: Annotated[Positional[Path | None], arg(metavar="MESH")] = None
-    """Garment mesh that lies on the body: obj, ply or glb. Left out with --region."""
+    """Garment mesh that lies on the body: obj, ply, glb, gltf, stl or off. Left out with --region."""
     output: Path
     """template.npz to write, as in a capture folder."""
     body: Path | None = None
@@ -63,11 +63,11 @@ class RegisterMesh:
     """Register any template to any scan, two mesh files; writes the result, and its measures as JSON beside it."""
 
     template: Annotated[Positional[Path], arg(metavar="TEMPLATE")]
-    """Mesh to deform: obj, ply or glb. Its vertex order and faces are kept."""
+    """Mesh to deform: obj, ply, glb, gltf, stl or off. Its vertex order and faces are kept."""
     scan: Annotated[Positional[Path], arg(metavar="SCAN")]
-    """Mesh to fit it to: obj, ply or glb."""
+    """Mesh to fit it to: obj, ply, glb, gltf, stl or off."""
     output: Path
-    """Mesh to write: ply, obj or glb; the JSON has the same name."""
+    """Mesh to write: ply, obj, glb or off; the JSON has the same name."""
     config: Annotated[MeshRegistrationConfig, arg(name="")] = field(default_factory=MeshRegistrationConfig)
 
     def __call__(self) -> int:

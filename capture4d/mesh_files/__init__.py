@@ -1,1 +1,1 @@
-"""Mesh files: obj, ply and glb, with their colours and textures, in and out."""
+"""Mesh files with their colours and textures: obj, ply and glb in and out, gltf, stl and off in."""

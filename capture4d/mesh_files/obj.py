@@ -6,100 +6,93 @@ Read here because no packaged reader keeps the order of vertices across UV seams
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from capture4d.errors import InputError, NotFiniteError
-from capture4d.mesh_files.polygons import MeshFile, colour_bytes, polygon_corners, polygon_mesh
+from capture4d.errors import InputError
+from capture4d.files.text_lines import Numbers, plain_text
+from capture4d.mesh_files.materials import decoded
+from capture4d.mesh_files.obj_lines import Tables, at_once, line_by_line
+from capture4d.mesh_files.polygons import Painted, colour_bytes, polygon_corners, polygon_mesh
 from capture4d.types import Mesh
 
 __all__ = ["obj_bytes", "read_obj"]
 
-_MOST = 2**31 - 1
-"""What our own indices can count."""
+_KEYWORDS = b"vt vn vp o g s mg mtllib usemtl maplib usemap p l cstype deg lod bevel c_interp d_interp".split()
+"""What an OBJ without vertices and faces may begin with."""
 
 
-def read_obj(path: Path) -> MeshFile:
+def read_obj(path: Path) -> Painted:
     """Read an OBJ file; `capture4d.mesh_files.meshes.read_mesh` is the way in.
 
     Raises:
         InputError: names the line; the file is named there.
     """
-    vertices: list[list[float]] = []
-    texture: list[list[float]] = []
-    corners: list[int] = []
-    corner_texture: list[int] = []
-    sizes: list[int] = []
-    face_lines: list[int] = []
-
-    with path.open(encoding="utf-8", errors="replace") as lines:
-        for number, line in enumerate(lines, start=1):
-            fields = line.split()
-            if not fields:
-                continue
-            try:
-                if fields[0] == "v":
-                    vertices.append(_numbers(fields[1:7], at_least=3))
-                elif fields[0] == "vt":
-                    texture.append(_numbers(fields[1:3], at_least=2))
-                elif fields[0] == "f":
-                    if len(fields) < 4:
-                        raise InputError(f"expected a face of at least 3 corners, found {len(fields) - 1}")
-                    sizes.append(len(fields) - 1)
-                    face_lines.append(number)
-                    for field in fields[1:]:
-                        vertex, _, rest = field.partition("/")
-                        uv = rest.partition("/")[0]
-                        corners.append(_index(vertex, len(vertices)))
-                        corner_texture.append(_index(uv, len(texture)) if uv else -1)
-            except InputError as error:
-                raise type(error)(error.reason, line=number) from None
-
-    size_of = np.array(sizes, np.int64)
-    corner_of = np.array(corners, np.int64)
-    texture_of = np.array(corner_texture, np.int64)
-    for name, indices, count in (
-        ("vertex", corner_of, len(vertices)),
-        ("texture coordinate", texture_of, len(texture)),
-    ):
-        beyond = np.flatnonzero(indices >= count)
-        if len(beyond):
-            line = face_lines[int(np.searchsorted(np.cumsum(size_of), beyond[0], side="right"))]
-            raise InputError(f"{name} {indices[beyond[0]] + 1} does not exist, the file has {count}", line=line)
-
-    coloured = bool(vertices) and all(len(vertex) == 6 for vertex in vertices)
-    table = np.array([vertex if coloured else vertex[:3] for vertex in vertices], np.float64)
-    table = table.reshape(-1, 6 if coloured else 3)
-    has_uv = len(texture_of) and (texture_of >= 0).all()
-    corner_uv = np.array(texture, np.float64)[texture_of] if has_uv else None
-    mesh, polygon_sizes = polygon_mesh(table[:, :3], corner_of, size_of, corner_uv)
-    return MeshFile(mesh, colour_bytes(table[:, 3:]) if coloured else None, polygon_sizes)
+    text = plain_text(path.read_bytes())
+    tables = at_once(text)
+    if tables is None:
+        tables = line_by_line(text)
+    if not len(tables.vertices.counts) and not len(tables.sizes):
+        _require_keyword(text)
+    return _assembled(tables)
 
 
-def _numbers(fields: list[str], *, at_least: int) -> list[float]:
-    try:
-        numbers = [float(field) for field in fields]
-    except ValueError:
-        raise InputError(f"expected numbers, found '{' '.join(fields)[:80]}'") from None
-    if len(numbers) < at_least:
-        raise InputError(f"expected at least {at_least} numbers, found {len(numbers)}")
-    if not np.isfinite(numbers).all():
-        raise NotFiniteError(f"expected finite numbers, found '{' '.join(fields)[:80]}'")
-    return numbers
+def _require_keyword(text: bytes) -> None:
+    """A file without a mesh is an empty one if its first line is one of an OBJ, and else something else."""
+    for number, line in enumerate(text.split(b"\n"), start=1):
+        words = line.split(None, 1)
+        if words and not words[0].startswith(b"#"):
+            if words[0].lower() not in _KEYWORDS:
+                raise InputError(f"not an OBJ file, found '{decoded(line[:40])}'", line=number)
+            return
 
 
-def _index(text: str, count: int) -> int:
-    """OBJ counts from 1, or backwards from the latest entry with -1."""
-    try:
-        index = int(text)
-    except ValueError:
-        raise InputError(f"expected an index, found '{text[:80]}'") from None
-    if abs(index) > _MOST:
-        raise InputError(f"expected an index of at most {_MOST}, found '{text[:80]}'")
-    if index == 0 or index < -count:
-        raise InputError(f"expected an index from 1, or from -1 down to -{count}, found {index}")
-    return index - 1 if index > 0 else count + index
+def _assembled(tables: Tables) -> Painted:
+    vertices, texture = tables.vertices, tables.texture
+    corner_uv = None
+    if (tables.corner_texture >= 0).any():
+        rows = np.full((len(texture.counts) + 1, 2), np.nan, np.float32)  # the last one is that of -1
+        rows[:-1, 0] = texture.flat[texture.first[:-1]]
+        rows[:-1, 1] = 0
+        two = texture.counts >= 2
+        rows[:-1, 1][two] = texture.flat[texture.first[:-1][two] + 1]
+        corner_uv = rows[tables.corner_texture]
+    found, uv = polygon_mesh(vertices.columns(3), tables.corners, tables.sizes, corner_uv)
+    colours, notes = _colours(vertices)
+    paint = np.repeat(tables.material, tables.sizes - 2) if tables.names.materials else None
+    return Painted(
+        replace(found, colours=colours, notes=found.notes + notes),
+        uv,
+        paint,
+        names=tuple(decoded(each) for each in tables.names.materials),
+        libraries=tuple(decoded(each) for each in tables.names.libraries),
+    )
+
+
+def _colours(vertices: Numbers) -> tuple[np.ndarray | None, tuple[str, ...]]:
+    """Colours that stand behind the coordinates: of six numbers the last three.
+
+    Of seven, the fourth is a weight if it is 1 everywhere and the seventh is not, else the seventh is an opacity.
+    """
+    counts, first = vertices.counts, vertices.first[:-1]
+    six, seven = counts == 6, counts == 7
+    coloured = np.flatnonzero(six | seven)
+    if not len(coloured):
+        return None, ()
+    behind = np.full(len(counts), 3)
+    rows = first[seven]
+    if len(rows) and (vertices.flat[rows + 3] == 1).all() and not (vertices.flat[rows + 6] == 1).all():
+        behind[seven] = 4
+    values = vertices.flat[(first + behind)[coloured, None] + np.arange(3)]
+    found, notes = colour_bytes(values)
+    if len(coloured) == len(counts):
+        return found, notes
+    colours = np.zeros((len(counts), 3), np.uint8)
+    colours[coloured] = found
+    absent = len(counts) - len(coloured)
+    return colours, (*notes, f"{absent} of {len(counts)} vertices have no colour: black")
 
 
 def obj_bytes(mesh: Mesh, colours: np.ndarray | None, polygon_sizes: np.ndarray | None) -> bytes:

@@ -7,263 +7,209 @@ seams, or take a file that is cut off for an empty one.
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from capture4d.errors import InputError
-from capture4d.mesh_files.polygons import MeshFile, colour_bytes, polygon_corners, polygon_mesh
+from capture4d.mesh_files.materials import decoded
+from capture4d.mesh_files.ply_records import COLOURS, Element, Lists, read_binary, read_text
+from capture4d.mesh_files.polygons import Painted, colour_bytes, polygon_corners, polygon_mesh
+from capture4d.mesh_files.textures import of_faces_at_vertices
 from capture4d.types import Mesh
 
 __all__ = ["ply_bytes", "read_ply"]
 
 _TYPES = {
-    "char": "i1",
-    "int8": "i1",
-    "uchar": "u1",
-    "uint8": "u1",
-    "short": "i2",
-    "int16": "i2",
-    "ushort": "u2",
-    "uint16": "u2",
-    "int": "i4",
-    "int32": "i4",
-    "uint": "u4",
-    "uint32": "u4",
-    "float": "f4",
-    "float32": "f4",
-    "double": "f8",
-    "float64": "f8",
+    name: kind
+    for kind, names in {
+        "i1": ("char", "int8"),
+        "u1": ("uchar", "uint8"),
+        "i2": ("short", "int16"),
+        "u2": ("ushort", "uint16"),
+        "i4": ("int", "int32"),
+        "u4": ("uint", "uint32"),
+        "i8": ("int64",),
+        "u8": ("uint64",),
+        "f4": ("float", "float32"),
+        "f8": ("double", "float64"),
+    }.items()
+    for name in names
 }
+_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+_END = re.compile(rb"(?:^|[\r\n])[ \t]*end_header[ \t]*(\r\n|\r|\n|\Z)")
+_LINE = re.compile(r"\r\n|\r|\n")
+_TEXTURE = re.compile(r"(?:comment|obj_info)\s+TextureFile\s+(.+)", re.IGNORECASE)
+
+_INDICES = ("vertex_indices", "vertex_index", "vertex_indexes")
+_VERTEX_UV = (
+    ("s", "t"),
+    ("u", "v"),
+    ("texture_u", "texture_v"),
+    ("texture_s", "texture_t"),
+    ("texcoord_u", "texcoord_v"),
+    ("tex_u", "tex_v"),
+)
+_FACE_UV = ("texcoord", "texcoords", "tex_coord", "tex_coords")
 
 
-_INDICES = ("vertex_indices", "vertex_index")
+@dataclass(frozen=True, slots=True)
+class _Header:
+    elements: list[Element]
+    order: str
+    """Of the bytes in a number, '<' or '>'; '' for a text."""
+    images: tuple[str, ...]
+    lines: int
+    size: int
 
 
-@dataclass(slots=True)
-class _Element:
-    """One kind of record in a PLY file, and its columns once they are read."""
-
-    name: str
-    count: int
-    properties: list[tuple[str, str, str]]
-    """Name, type, and for a list the type of its length, else ''."""
-    columns: dict[str, Any]
-    """By property: (count,) for a value, (count, n) for lists of equal length, else a list of arrays."""
-
-    def __post_init__(self) -> None:
-        if self.count < 0:
-            raise ValueError(self.count)
-
-    def add(self, name: str, kind: str, length: str) -> None:
-        if any(name == other for other, _, _ in self.properties) or length.startswith("f"):
-            raise ValueError(name)
-        self.properties.append((name, kind, length))
-
-
-def read_ply(path: Path) -> MeshFile:
+def read_ply(path: Path) -> Painted:
     """Read a PLY file; `capture4d.mesh_files.meshes.read_mesh` is the way in.
 
     Raises:
         InputError: the file is damaged or cut off; the message does not name it.
     """
-    head, _, body = path.read_bytes().partition(b"end_header")
-    elements, order = _header(head)
-    body = body[2:] if body[:2] == b"\r\n" else body[1:]
-    if order:
-        _records_binary(elements, body, order)
+    data = path.read_bytes()
+    header = _header(data)
+    body = memoryview(data)[header.size :]
+    if header.order:
+        read_binary(header.elements, body, header.order)
     else:
-        _records_ascii(elements, body)
+        read_text(header.elements, bytes(body), header.lines + 1)
 
-    vertex, _ = _columns(elements, "vertex")
-    face_values, face = _columns(elements, "face")
-    if not {"x", "y", "z"} <= vertex.keys():
-        raise InputError(f"expected vertices with x, y and z, found {', '.join(vertex) or 'none'}")
-    vertices = np.column_stack([vertex[axis] for axis in "xyz"]).astype(np.float64)
-    colours = None
-    if {"red", "green", "blue"} <= vertex.keys():
-        colours = colour_bytes(np.column_stack([vertex[channel] for channel in ("red", "green", "blue")]))
-
-    for name in _INDICES:
-        if name in face_values:
-            raise InputError(f"expected a list of corners in every face, found one number called {name}")
-    lists = next((face[name] for name in _INDICES if name in face), [])
-    sizes = np.array([len(row) for row in lists], np.int64)
-    corners = _joined(lists, np.int64)
-    corner_uv = None
-    if "texcoord" in face:
-        texture = _joined(face["texcoord"], np.float64)
-        corner_uv = texture.reshape(-1, 2) if len(texture) == 2 * len(corners) else None
-    for u, v in (("s", "t"), ("u", "v"), ("texture_u", "texture_v")):
-        if corner_uv is None and {u, v} <= vertex.keys():
-            corner_uv = np.column_stack([vertex[u], vertex[v]])[np.clip(corners, 0, len(vertices) - 1)]
-    mesh, polygon_sizes = polygon_mesh(vertices, corners, sizes, corner_uv)
-    return MeshFile(mesh, colours, polygon_sizes)
+    vertex, faces = _element(header.elements, "vertex"), _element(header.elements, "face")
+    if not {"x", "y", "z"} <= vertex.values.keys():
+        found = ", ".join([*vertex.values, *vertex.lists])
+        raise InputError(f"expected vertices with x, y and z, found {found or 'none'}")
+    vertices = np.empty((vertex.count, 3), np.float32)
+    for axis, name in enumerate("xyz"):
+        vertices[:, axis] = vertex.values[name]
+    corners = _corners(header.elements, faces)
+    found, uv = polygon_mesh(vertices, corners.flat, corners.sizes, _uv(vertex, faces, corners))
+    colours, notes = _colours(vertex)
+    if colours is None:
+        colours, notes = _colours(faces)
+        if colours is not None:
+            of_triangle = np.repeat(colours, corners.sizes - 2, axis=0).astype(np.float64)
+            colours, more = of_faces_at_vertices(found.mesh, of_triangle)
+            notes += more
+    paint = _paint(faces, len(header.images), corners.sizes)
+    return Painted(replace(found, colours=colours, notes=found.notes + notes), uv, paint, images=header.images)
 
 
-def _columns(elements: list[_Element], name: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Of one element: its properties that are a value, and those that are a list."""
-    for element in elements:
-        if element.name == name:
-            lists = {each for each, _, length in element.properties if length}
-            kinds = {each: kind for each, kind, _ in element.properties}
-            for index in _INDICES:
-                if kinds.get(index, "i").startswith("f"):
-                    raise InputError(f"expected whole numbers as {index}, found a list of floats")
-            columns = element.columns
-            values = {each: columns[each] for each in columns if each not in lists}
-            return values, {each: columns[each] for each in columns if each in lists}
-    return {}, {}
-
-
-def _header(head: bytes) -> tuple[list[_Element], str]:
-    """The elements, still empty, and the byte order, '' for a text file."""
-    elements: list[_Element] = []
-    order = None
-    lines = head.decode("latin-1").splitlines()
-    if not lines or lines[0].strip() != "ply":
+def _header(data: bytes) -> _Header:
+    """The elements, still empty, and what else stands in the head."""
+    start = 3 * data.startswith(b"\xef\xbb\xbf")
+    end = _END.search(data, start) if b"end_header" in data else None
+    lines = _LINE.split(decoded(data[start : end.start() if end else 65_536]))
+    if lines[0].strip().lower() != "ply":
         raise InputError("not a PLY file, expected it to begin with 'ply'")
+    if end is None:
+        raise InputError("cut off in the header")
+    elements: dict[str, Element] = {}
+    latest: Element | None = None
+    order, images = None, {}
     for line in lines[1:]:
         try:
             match line.split():
-                case ["format", name, _]:
-                    order = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}[name]
+                case ["format", name, *_]:
+                    order = _ORDERS[name.lower()]
                 case ["element", name, count]:
-                    if any(name == element.name for element in elements):
+                    if name in elements or not re.fullmatch(r"[0-9]{1,15}", count):
                         raise ValueError(name)
-                    elements.append(_Element(name, int(count), [], {}))
-                case ["property", "list", length, kind, name]:
-                    elements[-1].add(name, _TYPES[kind], _TYPES[length])
-                case ["property", kind, name]:
-                    elements[-1].add(name, _TYPES[kind], "")
-        except (KeyError, ValueError, IndexError):
+                    latest = elements[name] = Element(name, int(count))
+                case ["property", "list", length, kind, name] if latest is not None:
+                    latest.add(name, _TYPES[kind.lower()], _TYPES[length.lower()])
+                case ["property", kind, name] if latest is not None:
+                    latest.add(name, _TYPES[kind.lower()], "")
+                case ["format" | "element" | "property", *_]:
+                    raise ValueError(line)
+        except (KeyError, ValueError):
             raise InputError(f"damaged header, cannot read '{line.strip()[:80]}'") from None
+        if named := _TEXTURE.fullmatch(line.strip()):
+            images[named[1]] = None
     if order is None or not elements:
         raise InputError("cut off in the header")
-    return elements, order
+    size = end.end()
+    if end[1] == b"\r\n" and re.match(
+        rb"[^\r\n]*\r[^\n]", data
+    ):  # lines end with \r: the rest is the first byte behind
+        size -= 1
+    return _Header(list(elements.values()), order, tuple(images), len(lines) + 1, size)
 
 
-def _records_binary(elements: list[_Element], body: bytes, order: str) -> None:
-    offset = 0
-    for element in elements:
-        if not element.properties:  # whatever their number, nothing is there
-            continue
-        offset = _equal_records(element, body, offset, order) or _single_records(element, body, offset, order)
+def _element(elements: list[Element], name: str) -> Element:
+    return next((element for element in elements if element.name == name), Element(name, 0))
 
 
-def _equal_records(element: _Element, body: bytes, offset: int, order: str) -> int | None:
-    """Read all records at once if each has lists as long as the first one's; the offset behind them, or None."""
-    fields: list[tuple] = []
-    size = offset
-    for name, kind, length in element.properties:
-        entries = 0
-        if length:
-            step = np.dtype(length).itemsize
-            if size + step > len(body):
-                return None
-            entries = int(np.frombuffer(body, order + length, 1, size)[0])
-            if entries < 0 or entries > len(body):
-                return None
-            fields.append((f"{name} length", order + length))
-            size += step
-        fields.append((name, order + kind, (entries,)) if length else (name, order + kind))
-        size += np.dtype(kind).itemsize * (entries if length else 1)
-    record = np.dtype(fields)
-    end = offset + record.itemsize * element.count
-    if end > len(body) or not element.count:
+def _corners(elements: list[Element], faces: Element) -> Lists:
+    """The corners of all faces, or of the triangles of strips where there are no faces."""
+    strips = _element(elements, "tristrips")
+    for element in (faces, strips):
+        for name, kind, length in element.properties:
+            if name.lower() in _INDICES and not length:
+                raise InputError(f"expected a list of corners in every {element.name}, found one number called {name}")
+            if name.lower() in _INDICES and kind.startswith("f"):
+                raise InputError(f"expected whole numbers as {name}, found a list of floats")
+    none = Lists(np.zeros(0, np.int64), np.zeros(0, np.int64))
+    found = next((faces.lists[name] for name in _INDICES if name in faces.lists), none)
+    of_strips = next((strips.lists[name] for name in _INDICES if name in strips.lists), none)
+    return found if len(found.sizes) or not len(of_strips.sizes) else _triangles(of_strips)
+
+
+def _triangles(strips: Lists) -> Lists:
+    """Of strips of triangles, which begin anew behind -1; without those of no area, which only lead on."""
+    ends = np.cumsum(strips.sizes)
+    corners = np.insert(strips.flat.astype(np.int64), ends, -1)
+    begin = np.maximum.accumulate(np.where(corners < 0, np.arange(len(corners)) + 1, 0))
+    a, b, c = corners[:-2], corners[1:-1], corners[2:]
+    first = np.flatnonzero((np.minimum(np.minimum(a, b), c) >= 0) & (a != b) & (b != c) & (a != c))
+    odd = (first - begin[first]) % 2 == 1  # every second triangle of a strip winds the other way
+    faces = np.column_stack([np.where(odd, b[first], a[first]), np.where(odd, a[first], b[first]), c[first]])
+    return Lists(np.full(len(faces), 3), faces.reshape(-1))
+
+
+def _colours(element: Element) -> tuple[np.ndarray | None, tuple[str, ...]]:
+    """Those of its records as bytes, if they have any."""
+    for names in COLOURS:
+        if all(name in element.values for name in names):
+            channels = [element.values[name] for name in names]
+            if len({channel.dtype for channel in channels}) == 1:
+                return colour_bytes(np.stack(channels, axis=1))
+            each = [colour_bytes(np.repeat(channel[:, None], 3, axis=1)) for channel in channels]
+            return np.stack([found[:, 0] for found, _ in each], axis=1), each[0][1]
+    return None, ()
+
+
+def _uv(vertex: Element, faces: Element, corners: Lists) -> np.ndarray | None:
+    """UVs at the corners: those of the faces, else of the vertices."""
+    for name in _FACE_UV:
+        if name in faces.lists and len(faces.lists[name].sizes) == len(corners.sizes):
+            found = faces.lists[name]
+            whole = found.sizes == 2 * corners.sizes
+            if whole.all():
+                return found.flat.reshape(-1, 2)
+            if whole.any():
+                uv = np.full((len(corners.flat), 2), np.nan, np.float32)
+                uv[np.repeat(whole, corners.sizes)] = found.flat[np.repeat(whole, found.sizes)].reshape(-1, 2)
+                return uv
+    for names in _VERTEX_UV:
+        if all(name in vertex.values for name in names) and vertex.count:
+            table = np.stack([vertex.values[name] for name in names], axis=1).astype(np.float32)
+            return table[np.clip(corners.flat, 0, vertex.count - 1)]
+    return None
+
+
+def _paint(faces: Element, images: int, sizes: np.ndarray) -> np.ndarray | None:
+    """Which image each triangle has; None if the file does not say."""
+    number = faces.values.get("texnumber")
+    if number is None or not images or len(number) != len(sizes):
         return None
-    records = np.frombuffer(body, record, element.count, offset)
-    for name, _, length in element.properties:
-        if length and (records[f"{name} length"] != records[f"{name} length"][0]).any():
-            return None
-    element.columns = {name: records[name] for name, _, _ in element.properties}
-    return end
-
-
-def _single_records(element: _Element, body: bytes, offset: int, order: str) -> int:
-    """Read record by record, for lists of mixed lengths."""
-    rows: dict[str, list[np.ndarray]] = {name: [] for name, _, _ in element.properties}
-    types = [
-        (name, np.dtype(order + kind), np.dtype(order + length) if length else None)
-        for name, kind, length in element.properties
-    ]
-    try:
-        for _ in range(element.count):
-            for name, kind, length in types:
-                entries = 1
-                if length:
-                    entries = int(np.frombuffer(body, length, 1, offset)[0])
-                    offset += length.itemsize
-                    if entries < 0:
-                        raise ValueError(entries)
-                rows[name].append(np.frombuffer(body, kind, entries, offset))
-                offset += kind.itemsize * entries
-    except ValueError:
-        raise _cut_off(element, min(map(len, rows.values()))) from None
-    _keep(element, rows)
-    return offset
-
-
-def _records_ascii(elements: list[_Element], body: bytes) -> None:
-    try:
-        numbers = np.array(body.split(), np.float64)
-    except ValueError as error:
-        raise InputError(f"damaged, {error}") from None
-    offset = 0
-    for element in elements:
-        if not element.properties:
-            continue
-        if not any(length for _, _, length in element.properties):
-            table = numbers[offset : offset + element.count * len(element.properties)]
-            if len(table) < element.count * len(element.properties):
-                raise _cut_off(element, len(table) // len(element.properties))
-            offset += len(table)
-            table = table.reshape(element.count, len(element.properties))
-            element.columns = {
-                name: _typed(table[:, index], kind, name) for index, (name, kind, _) in enumerate(element.properties)
-            }
-            continue
-        rows: dict[str, list[np.ndarray]] = {name: [] for name, _, _ in element.properties}
-        for row in range(element.count):
-            for name, kind, length in element.properties:
-                entries = 1
-                if length:
-                    entries = int(np.nan_to_num(numbers[offset], nan=-1)) if offset < len(numbers) else 1
-                    offset += 1
-                if entries < 0 or offset + entries > len(numbers):
-                    raise _cut_off(element, row)
-                rows[name].append(_typed(numbers[offset : offset + entries], kind, name))
-                offset += entries
-        _keep(element, rows)
-
-
-def _typed(numbers: np.ndarray, kind: str, name: str) -> np.ndarray:
-    """Numbers of a text file as the type that its header gives them."""
-    typed = numbers.astype(kind)
-    if not kind.startswith("f") and (typed != numbers).any():
-        wrong = numbers[typed != numbers][0]
-        raise InputError(f"expected {name} from {np.iinfo(kind).min} to {np.iinfo(kind).max}, found {wrong:g}")
-    return typed
-
-
-def _keep(element: _Element, rows: dict[str, list[np.ndarray]]) -> None:
-    element.columns = {
-        name: rows[name] if length else np.concatenate([np.empty(0, kind), *rows[name]])
-        for name, kind, length in element.properties
-    }
-
-
-def _cut_off(element: _Element, found: int) -> InputError:
-    return InputError(f"cut off, expected {element.count} records of '{element.name}', found {found}")
-
-
-def _joined(lists: Any, dtype: type) -> np.ndarray:
-    return (
-        lists.reshape(-1).astype(dtype) if isinstance(lists, np.ndarray) else np.concatenate([*lists, []]).astype(dtype)
-    )
+    number = np.where(np.isfinite(number) & (number >= 0), number, -1).astype(np.int64)
+    return np.repeat(np.minimum(number, 0) if images == 1 else number, sizes - 2)
 
 
 def ply_bytes(mesh: Mesh, colours: np.ndarray | None, polygon_sizes: np.ndarray | None) -> bytes:

@@ -1,4 +1,4 @@
-"""Textures: the image that a mesh file names, and its colours at the vertices.
+"""Textures: the colours of a picture at the vertices of a mesh.
 
 The image is read at every face corner, between pixels, and a vertex takes the mean of its corners: across a seam both
 sides show the same paint.
@@ -6,44 +6,20 @@ sides show the same paint.
 
 from __future__ import annotations
 
-import re
-from pathlib import Path
 from typing import Literal, assert_never
 
 import numpy as np
 from jaxtyping import Float, Float64, Integer, UInt8
 
 from capture4d.errors import InputError
-from capture4d.files.reading import companion
 from capture4d.types import Mesh
 
-__all__ = ["Wrap", "mean_at_vertices", "named_texture", "sampled", "texture_colours"]
+__all__ = ["Wrap", "mean_at_vertices", "of_faces_at_vertices", "sampled", "texture_colours"]
 
-_HEAD = 65_536
 _EDGE = 1e-4
 """How far beyond its edge a texture does not begin again: rounding put the coordinate there."""
 Wrap = Literal["repeat", "mirror", "clamp"]
 """How a texture goes on beyond its edges."""
-
-
-def named_texture(path: Path) -> Path | None:
-    """The one image that the head of an obj (by its mtl) or of a ply names.
-
-    Raises:
-        InputError: it names several, one that is not there, or one that does not lie beside it or in a folder below.
-    """
-    with path.open("rb") as file:
-        head = file.read(_HEAD).decode("utf-8", errors="replace")
-    if path.suffix.lower() == ".ply":
-        names = re.findall(r"^comment TextureFile (.+?)\s*$", head.partition("end_header")[0], re.M)
-    else:
-        names = []
-        for library in re.findall(r"^mtllib (.+?)\s*$", head, re.M):
-            lines = companion(path, library, "materials").read_text(encoding="utf-8", errors="replace")
-            names += re.findall(r"^\s*map_Kd (?:-\S+ \S+ )*(.+?)\s*$", lines, re.M)
-    if len(set(names)) > 1:
-        raise InputError(f"expected one texture, found {', '.join(sorted(set(names)))}", where=path)
-    return companion(path, names[0], "texture") if names else None
 
 
 def texture_colours(mesh: Mesh, image: UInt8[np.ndarray, "rows columns 3"]) -> UInt8[np.ndarray, "verts 3"]:
@@ -109,3 +85,21 @@ def mean_at_vertices(
     corners = np.maximum(np.bincount(vertex, minlength=count), 1)
     sums = [np.bincount(vertex, colours[:, channel], minlength=count) for channel in range(3)]
     return np.clip(np.rint(np.stack(sums, axis=1) / corners[:, None]), 0, 255).astype(np.uint8)
+
+
+def of_faces_at_vertices(
+    mesh: Mesh, colours: Float64[np.ndarray, "faces 3"]
+) -> tuple[UInt8[np.ndarray, "verts 3"] | None, tuple[str, ...]]:
+    """Colours of faces as the mean at each vertex, and a note of the vertices that have none, which are black.
+
+    Args:
+        colours: from 0 to 255; NaN for faces without.
+    """
+    known = np.isfinite(colours).all(axis=1)
+    if not known.any():
+        return None, ()
+    corners = np.repeat(colours[known], 3, axis=0)
+    count = len(mesh.vertices)
+    bare = count - len(np.unique(mesh.faces[known]))
+    notes = (f"{bare} of {count} vertices are in no coloured face: black",) if bare else ()
+    return mean_at_vertices(mesh.faces[known].reshape(-1), corners, count), notes

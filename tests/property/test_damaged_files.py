@@ -152,7 +152,7 @@ def materials(path: Path, picture: str = "skin.png") -> None:
     if not (path.parent / picture).exists():
         Image.fromarray(RNG.integers(0, 256, (4, 4, 3), np.uint8)).save(path.parent / picture)
     path.with_name("mesh.obj").write_text(
-        "mtllib mesh.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n"
+        "mtllib mesh.mtl\nusemtl skin\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n"
     )
 
 

@@ -109,6 +109,14 @@ def _sample_files() -> dict[str, bytes]:
     files["text.ply"] = f"{head}element face 1\nproperty list char int vertex_indices\nend_header\n".encode() + (
         b"0 0 0\n1 0 0\n1 1 0\n3 0 1 2\n"
     )
+    model = trimesh.Trimesh(vertices, faces, process=False)
+    for name, kind in (("text.stl", "stl_ascii"), ("binary.stl", "stl")):
+        data = model.export(file_type=kind)
+        files[name] = data if isinstance(data, bytes) else str(data).encode()
+    files["colours.off"] = b"COFF\n3 1 0\n0 0 0 1 2 3\n1 0 0 4 5 6\n1 1 0 7 8 9 # last\n3 0 1 2 0.5 0.5 0.5\n"
+    files["odd.obj"] = (
+        b"mtllib x.mtl\n" + b"v 0 0 0 1 0 0\nv 1 0 0 .5 nan 0\n v 1 1 0 1 \\\n 1 1 # last\nvt nan 0\nf 1/1 -2// 3\n"
+    )
     return files
 
 
