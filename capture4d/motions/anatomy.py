@@ -41,7 +41,9 @@ def _scheme(title: str, leg: str, arm: str) -> _Scheme:
 
 
 _HUMANIK = _scheme(
-    "Mixamo, MotionBuilder", "upleg leg foot toebase|toe|forefoot|toes", "shoulder|collar|clavicle arm forearm hand|wrist"
+    "Mixamo, MotionBuilder",
+    "upleg leg foot toebase|toe|forefoot|toes",
+    "shoulder|collar|clavicle arm forearm hand|wrist",
 )
 _JOINTS = _scheme(
     "SMPL, CMU",
@@ -49,14 +51,20 @@ _JOINTS = _scheme(
     "collar|clavicle|thorax|scapula shoulder elbow wrist|hand",
 )
 _ROKOKO = _scheme("Rokoko", "thigh shin foot toe|toes|toebase", "shoulder|clavicle arm forearm hand")
-_XSENS = _scheme("Xsens", "upperleg lowerleg foot toe|toes|toebase", "shoulder|collar|clavicle upperarm forearm hand|wrist")
-_UNITY = _scheme("Unity, VRM", "upperleg lowerleg foot toes|toe|toebase", "shoulder|collar|clavicle upperarm lowerarm hand|wrist")
+_XSENS = _scheme(
+    "Xsens", "upperleg lowerleg foot toe|toes|toebase", "shoulder|collar|clavicle upperarm forearm hand|wrist"
+)
+_UNITY = _scheme(
+    "Unity, VRM", "upperleg lowerleg foot toes|toe|toebase", "shoulder|collar|clavicle upperarm lowerarm hand|wrist"
+)
 _BIPED = _scheme("3ds Max Biped", "thigh calf foot toe0|toe|toebase", "clavicle|shoulder upperarm forearm hand")
 _UNREAL = _scheme("Unreal", "thigh calf foot ball|toe", "clavicle|shoulder upperarm lowerarm hand")
 _MOTIVE = _scheme("Motive", "thigh shin foot toe", "shoulder|collar uarm|upperarm farm|forearm hand")
 _BLENDER = _scheme("Blender Rigify", "thigh shin|calf foot toe|toes", "shoulder|clavicle upperarm forearm hand")
 _DAZ = _scheme(
-    "Daz, Poser", "thigh|thighbend shin foot toe|toes", "collar|clavicle shldr|shldrbend|shoulder forearm|forearmbend hand"
+    "Daz, Poser",
+    "thigh|thighbend shin foot toe|toes",
+    "collar|clavicle shldr|shldrbend|shoulder forearm|forearmbend hand",
 )
 _BEAT = _scheme("Vicon", "upleg leg foot forefoot|toebase", "shoulder arm arm1 hand")
 _ASF = _scheme("CMU's asf", "femur tibia foot toes", "clavicle humerus radius wrist|hand")
@@ -94,7 +102,7 @@ _PARTS = {
 _WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
 _LABELS = {"jnt", "joint", "bone", "bind", "jt", "bn", "def", "org", "sk", "mixamorig", "bip", "character", "biped"}
 """Words in a name that say nothing of the part."""
-_HEADS = ("head", "skull", "headc", "headm", "headx", "chead", "mhead")
+_HEADS = ("head", "skull", "head1", "headc", "headm", "headx", "chead", "mhead")
 _TURNING = re.compile(r"twist|roll", re.I)
 _SIDE_WORDS = {"left": 0, "l": 0, "lft": 0, "lt": 0, "right": 1, "r": 1, "rgt": 1, "rt": 1}
 
@@ -288,7 +296,9 @@ class _Trial:
             choices.append(joints + [None] * (part not in fixed and (LIMBS[slot] in OPTIONAL or not joints)))
         for chain in itertools.product(*choices):
             if self._hangs_together(tree, [joint for joint in chain if joint is not None]):
-                self.limbs |= {f"{side}_{LIMBS[slot]}": j for slot, j in zip(slots, chain, strict=True) if j is not None}
+                self.limbs |= {
+                    f"{side}_{LIMBS[slot]}": j for slot, j in zip(slots, chain, strict=True) if j is not None
+                }
                 return
         self.lacking.extend(f"{side}_{LIMBS[slot]}" for slot in slots if LIMBS[slot] not in OPTIONAL)
 

@@ -254,9 +254,7 @@ def _channels(words: list[str]) -> list[tuple[str, str]]:
     for word in words[2:]:
         parts = _CHANNEL.fullmatch(word.lower())
         if parts is None:
-            raise InputError(
-                f"expected channels such as Xposition and Zrotation, found '{shortened(word, 80)}'"
-            )
+            raise InputError(f"expected channels such as Xposition and Zrotation, found '{shortened(word, 80)}'")
         found.append((parts[1], _KINDS[parts[2]]))
     return found
 

@@ -35,7 +35,14 @@ _STANDS = 0.8
 _LEG_M = (0.5, 1.3)
 """Thigh and shin of people."""
 _UNITS = {**METRES, "dm": 0.1, "ft": 0.3048}
-_UNIT_WORDS = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches", "dm": "decimetres", "ft": "feet"}
+_UNIT_WORDS = {
+    "m": "metres",
+    "cm": "centimetres",
+    "mm": "millimetres",
+    "in": "inches",
+    "dm": "decimetres",
+    "ft": "feet",
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -23,7 +23,7 @@ _FOOT = np.array([0.0, -0.05, 0.12])
 _BENT = 0.05
 """Mean sine of a joint that is bent enough to show its axis."""
 _FLEXES = {"hip": np.array([0.0, 0.0, -1.0]), "shoulder": np.array([0.0, 0.0, 1.0])}
-"""Where shin and forearm go when knee and elbow bend, at rest."""
+"""Where shin and forearm go when knee and elbow bend, in a T-pose."""
 
 
 def rest_turns(clip: Clip, bones: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -41,11 +41,21 @@ def rest_turns(clip: Clip, bones: Mapping[str, np.ndarray]) -> dict[str, np.ndar
         if _stands(clip):
             continue
         collar = f"{side}_collar"
-        if collar in clip.anatomy.limbs and np.linalg.norm(clip.bone(collar, f"{side}_shoulder")) > 1e-9:
-            turns[collar] = aligned(bones[collar], clip.bone(collar, f"{side}_shoulder"))
+        if (
+            collar in bones
+            and collar in clip.anatomy.limbs
+            and np.linalg.norm(clip.bone(collar, f"{side}_shoulder")) > 1e-9
+        ):
+            turns[collar] = aligned(_t_pose(collar), clip.bone(collar, f"{side}_shoulder"))
         turns |= _leg_by_motion(clip, bones, side, turns) | _hinge(clip, bones, f"{side}_shoulder", turns)
         turns[f"{side}_wrist"] = turns[f"{side}_elbow"]
     return turns
+
+
+def _t_pose(part: str) -> np.ndarray:
+    """Where a limb points in a T-pose."""
+    side, _, limb = part.partition("_")
+    return np.array([0.0, -1.0, 0.0] if limb in ("hip", "knee") else [1.0 if side == "left" else -1.0, 0.0, 0.0])
 
 
 _NEXT = {"hip": "knee", "knee": "ankle", "shoulder": "elbow", "elbow": "wrist"}
@@ -75,7 +85,9 @@ def _leg_by_motion(
     assert knee is not None
     assert ankle is not None
     local = np.swapaxes(clip.world[:, knee], 1, 2) @ clip.world[:, ankle]
-    across = local.mean(axis=0).T @ found[f"{side}_knee"][:, 0]
+    across = (
+        local.mean(axis=0).T @ found[f"{side}_knee"] @ aligned(bones[f"{side}_knee"], _t_pose(f"{side}_knee")).T[:, 0]
+    )
     toes = None if foot is None else clip.rest[foot] - clip.rest[ankle]
     if toes is None or not np.linalg.norm(toes) > 1e-9:
         mean = Rotation.from_matrix(local).mean().as_matrix()
@@ -98,10 +110,13 @@ def _hinge(
     if np.linalg.norm(bend) < _BENT:
         return {part: turns[part], middle: turns[middle]}
     axis = np.cross(along, bend)
-    ours = np.cross(bones[part], _FLEXES[limb])
-    first = _frame(upper, axis) @ _frame(bones[part], ours).T
     carried = (np.swapaxes(local, 1, 2) @ axis).mean(axis=0)
-    return {part: first, middle: _frame(lower, carried) @ _frame(bones[middle], ours).T}
+    straight = _t_pose(part)
+    ours = _frame(straight, np.cross(straight, _FLEXES[limb])).T
+    return {
+        part: _frame(upper, axis) @ ours @ aligned(bones[part], straight),
+        middle: _frame(lower, carried) @ ours @ aligned(bones[middle], straight),
+    }
 
 
 def _frame(along: np.ndarray, axis: np.ndarray) -> np.ndarray:

@@ -103,11 +103,11 @@ def _skeleton(shaped: ShapedBody) -> _Skeleton:
     """Of a body; it has every limb.
 
     Raises:
-        InputError: the body lacks joints.
+        InputError: the body lacks some of them.
     """
     names = shaped.body.joint_names
     found = _SMPL if is_smpl(names) else _BUILT_IN
-    _require_joints(shaped, found.drives)
+    _require_joints(shaped, [joint for part, joint in found.limbs.items() if not part.endswith("collar")])
     return found
 
 
@@ -194,10 +194,9 @@ def _shared(world: np.ndarray, base: int, chain: Sequence[int], count: int) -> l
 
 def _rest_bones(shaped: ShapedBody, skeleton: _Skeleton) -> dict[str, np.ndarray]:
     """Part of a limb -> from it to the next one at rest."""
-    places = {
-        part: shaped.joints[shaped.body.joint_names.index(name)] for part, name in skeleton.limbs.items()
-    }
-    return {part: places[AIMS[part]] - places[part] for part in skeleton.limbs if part in AIMS}
+    names = shaped.body.joint_names
+    places = {part: shaped.joints[names.index(name)] for part, name in skeleton.limbs.items() if name in names}
+    return {part: places[AIMS[part]] - places[part] for part in places if part in AIMS}
 
 
 def as_smpl(shaped: ShapedBody, poses: PoseSequence) -> tuple[Float64[np.ndarray, "frames 22 3 3"], np.ndarray]:
@@ -210,6 +209,7 @@ def as_smpl(shaped: ShapedBody, poses: PoseSequence) -> tuple[Float64[np.ndarray
         Local rotations, and where the pelvis is, (T, 3).
     """
     skeleton, tree = _skeleton(shaped), list(SMPL_TREE)
+    _require_joints(shaped, skeleton.drives)
     names = list(shaped.body.joint_names)
     ours, centres = _world(shaped, poses)
     driver = {part: joint for joint, part in skeleton.drives.items()}

@@ -127,9 +127,7 @@ def _all_rotations(arrays: ArrayFile, names: _Names) -> np.ndarray:
     return _rotations(arrays, whole, range(JOINTS, 128))[:, :JOINTS]
 
 
-def _rotations(
-    arrays: ArrayFile, name: str, joints: Iterable[int], frames: int | None = None
-) -> np.ndarray:
+def _rotations(arrays: ArrayFile, name: str, joints: Iterable[int], frames: int | None = None) -> np.ndarray:
     """An array as rotation matrices, (T, J, 3, 3).
 
     Args:
@@ -203,7 +201,9 @@ def _checked(matrices: np.ndarray, name: str) -> np.ndarray:
 def _require_finite(array: np.ndarray, name: str) -> None:
     wrong = np.flatnonzero(~np.isfinite(array).reshape(len(array), -1).all(axis=1))
     if len(wrong):
-        raise InputError(f"'{name}': expected finite numbers, found NaN or infinity in frame {wrong[0]} of {len(array)}")
+        raise InputError(
+            f"'{name}': expected finite numbers, found NaN or infinity in frame {wrong[0]} of {len(array)}"
+        )
 
 
 # --- the rest ----------------------------------------------------------------------------------------------------
