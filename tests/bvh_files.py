@@ -129,7 +129,7 @@ class Layout:
     edit: Callable[[str], str] = str
 
 
-def text(source: Source, layout: Layout = Layout()) -> str:  # noqa: B008
+def text(source: Source, layout: Layout = Layout()) -> str:
     children: list[list[int]] = [[] for _ in source.names]
     for joint, parent in enumerate(source.parents):
         if parent >= 0:

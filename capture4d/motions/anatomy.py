@@ -290,10 +290,11 @@ class _Trial:
             found = [joint for word in self.scheme.words[slot] for joint in tree.sided.get((number, word), [])]
             if LIMBS[slot] == "hip":  # some have a joint on the way to it, the hip joint
                 found.sort(key=lambda joint: -len(tree.way_up(joint)))
-            joints: list[int | None] = [fixed[part]] if part in fixed else [*dict.fromkeys(found)][:6]
+            joints = [fixed[part]] if part in fixed else [*dict.fromkeys(found)][:6]
             if not joints and LIMBS[slot] not in OPTIONAL:
                 self.lacking.append(part)
-            choices.append(joints + [None] * (part not in fixed and (LIMBS[slot] in OPTIONAL or not joints)))
+            may_lack = part not in fixed and (LIMBS[slot] in OPTIONAL or not joints)
+            choices.append([*joints, *[None] * may_lack])
         for chain in itertools.product(*choices):
             if self._hangs_together(tree, [joint for joint in chain if joint is not None]):
                 self.limbs |= {
@@ -318,7 +319,7 @@ _MIXED = _Scheme("several tools", tuple(tuple(dict.fromkeys(itertools.chain.from
 
 
 def _said_of(trial: _Trial, naming: str, names: Sequence[str]) -> str:
-    parts = dict(zip(LIMBS, trial.scheme.words, strict=True))
+    parts: dict[str, tuple[str, ...]] = dict(zip(LIMBS, trial.scheme.words, strict=True))
     wanted = [f"{part} ({parts[part.split('_')[1]][0]})".replace("_", " ") for part in dict.fromkeys(trial.lacking)]
     whose = trial.scheme.title if naming != "auto" else f"{trial.scheme.title}, which are nearest"
     return (f"expected joints named as those of {whose}, found none for {', '.join(wanted[:4])} "

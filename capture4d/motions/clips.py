@@ -17,7 +17,7 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from capture4d.errors import InputError
-from capture4d.motions.anatomy import Anatomy, find_anatomy
+from capture4d.motions.anatomy import NAMINGS, Anatomy, find_anatomy, named_parts
 from capture4d.motions.bvh import Bvh
 from capture4d.units import METRES
 
@@ -58,7 +58,17 @@ class MotionWords:
     facing: Axis | None = None
     """Axis of the file's world that becomes our +Z, where our bodies face at rest."""
 
+    @staticmethod
+    def of(names: str, up: Axis | None = None, facing: Axis | None = None) -> MotionWords:
+        """As a command line has them: `names` may also be a JSON file, our joint: their joint."""
+        if names.lower().endswith(".json"):
+            return MotionWords(given=named_parts(Path(names)), up=up, facing=facing)
+        return MotionWords(names=names, up=up, facing=facing)
+
     def __post_init__(self) -> None:
+        if self.names != "auto" and self.names not in NAMINGS:
+            known = ", ".join(NAMINGS)
+            raise InputError(f"--names: expected auto, {known} or a JSON file, found '{self.names}'")
         if self.up and self.facing and self.up[-1] == self.facing[-1]:
             raise InputError(f"--facing: expected an axis across that of --up, found {self.facing} and {self.up}")
 
@@ -118,11 +128,9 @@ def understood(bvh: Bvh, words: MotionWords | None = None) -> tuple[Clip, list[s
     )
     if not clip.leg > 0:
         raise InputError("expected legs with a length, found none", where=bvh.path)
-    found = [
-        f"joints named as by {anatomy.title}, {axis_name(axes[:, 1])} up, "
-        f"{axis_name(axes[:, 2])} forward, {unit_words(clip.leg)}"
-    ]
-    return clip, [*bvh.notes, *found, *([doubt] if doubt and not words.up else [])]
+    axes_said = f"{axis_name(axes[:, 1])} up, {axis_name(axes[:, 2])} forward"
+    found = f"joints named as by {anatomy.title}; {axes_said}; {unit_words(clip.leg)}"
+    return clip, [*bvh.notes, found, *([doubt] if doubt and not words.up else [])]
 
 
 def unit_words(leg: float) -> str:

@@ -31,7 +31,7 @@ from capture4d.files.records import load_poses, save_poses
 from capture4d.motions.bvh import Bvh, format_bvh, moved_by_root, read_bvh
 from capture4d.motions.clips import MotionWords, understood
 from capture4d.motions.own_skeleton import poses_of_own_skeleton
-from capture4d.motions.retargeting import as_smpl, is_smpl, retarget
+from capture4d.motions.retargeting import is_smpl, retarget
 from capture4d.motions.smpl_motions import AMASS_AXES, on_body, smpl_up, to_smpl
 from capture4d.motions.smpl_parameters import RATES, are_smpl_parameters, read_smpl_parameters
 from capture4d.types import Body, PoseSequence

@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 
 from capture4d.body.skinning import with_shape
-from capture4d.errors import InputError
 from capture4d.motions.anatomy import bare
 from capture4d.motions.bvh import Bvh
 from capture4d.motions.clips import MotionWords, understood
@@ -21,20 +20,17 @@ __all__ = ["poses_of_own_skeleton"]
 
 _UNITS = {"centimetres": 0.01, "metres": 1.0, "millimetres": 0.001, "inches": 0.0254, "decimetres": 0.1, "feet": 0.3048}
 """Metres in each; written are centimetres."""
-_SHAPE_MOST = 6.0
-"""Standard deviations: nobody is further from the mean."""
-_APART_M = 0.03
-"""Root mean square between the file's bones and those of the nearest shape: beyond it, it is another skeleton."""
+_EXACT_M = 0.002
+"""Root mean square between the file's bones and those of a shape, of files of this very body, rounded."""
+_NEAR_M, _NEAR_SHAPE = 0.03, 4.0
+"""The same of a skeleton with other proportions whose joints still turn as ours do, and how far from the mean, standard
+deviations, its shape may seem; beyond it is retargeted."""
 
 
 def poses_of_own_skeleton(
     bvh: Bvh, body: Body, words: MotionWords, fps: float
 ) -> tuple[PoseSequence, list[str]] | None:
-    """Poses of a file that has all joints of the body, and what was found of it; None if it is another skeleton.
-
-    Raises:
-        InputError: it is this skeleton, but in no unit that makes a person of it.
-    """
+    """Poses of a file that has all joints of the body, and what was found of it; None if it is another skeleton."""
     order = _order(bvh, body)
     if order is None or words.names != "auto" or words.given is not None:
         return None
@@ -45,14 +41,13 @@ def poses_of_own_skeleton(
         return None
     parents = np.maximum(body.parents, 0)
     bones = (clip.rest[order] - clip.rest[order][parents])[1:]
-    fits = {unit: _shape_of_bones(body, bones * metres) for unit, metres in _UNITS.items()}
-    unit, (shape, apart) = min(fits.items(), key=lambda fit: (not _human(*fit[1]), _furthest(fit[1][0])))
-    if not _human(shape, apart):
-        if _alike(body, bones):
-            raise InputError(f"expected this body's skeleton in {', '.join(_UNITS)}, found a leg of {clip.leg:.3g}; "
-                             "scale it to one of them", where=bvh.path)  # fmt: skip
+    fitted = _fitted(body, bones)
+    if fitted is None:
         return None
-    translations = clip.pelvis * _UNITS[unit] - with_shape(body, shape).joints[0]
+    metres, shape = fitted
+    unit = next((name for name, known in _UNITS.items() if known == metres), f"units of {1e3 * metres:.4g} mm")
+    notes = [*notes[:-1], f"{notes[-1]}; this body's own skeleton, in {unit}"]
+    translations = clip.pelvis * metres - with_shape(body, shape).joints[0]
     poses = PoseSequence(
         relative(clip.world[:, order], body.parents).astype(np.float32),
         translations.astype(np.float32),
@@ -83,28 +78,43 @@ def _untouched(bvh: Bvh, body: Body) -> bool:
     return bool((rest * ours).sum() > 0.95 * np.linalg.norm(rest) * np.linalg.norm(ours))
 
 
+def _fitted(body: Body, bones: np.ndarray) -> tuple[float, np.ndarray] | None:
+    """Metres in the file's unit, and the shape that its bones show; None if they are nobody's in our shape space."""
+    fits = [(*_shape_of_bones(body, bones * metres), metres) for metres in _UNITS.values()]
+    shape, apart, metres = min(fits, key=lambda fit: fit[1])
+    if apart < _EXACT_M:
+        return metres, shape
+    shape, apart, own_metres = _shape_and_scale(body, bones)
+    if apart < _EXACT_M and own_metres > 0:
+        return own_metres, shape
+    shape, apart, metres = min(fits, key=lambda fit: np.abs(fit[0]).max(initial=0))
+    return (metres, shape) if apart < _NEAR_M and np.abs(shape).max(initial=0) < _NEAR_SHAPE else None
+
+
 def _shape_of_bones(body: Body, bones: np.ndarray) -> tuple[np.ndarray, float]:
     """The shape whose bones are nearest to the given ones, (S,) float32, and how far these are from its, metres."""
+    mean, columns = _bone_space(body)
+    error = bones.ravel() - mean
+    shape = np.linalg.solve(columns.T @ columns + 1e-9 * np.eye(columns.shape[1]), columns.T @ error)
+    return shape.astype(np.float32), _apart(error - columns @ shape)
+
+
+def _shape_and_scale(body: Body, bones: np.ndarray) -> tuple[np.ndarray, float, float]:
+    """The same with the scale that fits best: bones * metres = mean + columns @ shape is linear in both."""
+    mean, columns = _bone_space(body)
+    size = max(float(np.linalg.norm(bones)), 1e-30)
+    system = np.column_stack([bones.ravel() / size, -columns])
+    solved = np.linalg.solve(system.T @ system + 1e-9 * np.eye(system.shape[1]), system.T @ mean)
+    return solved[1:].astype(np.float32), _apart(system @ solved - mean), float(solved[0] / size)
+
+
+def _bone_space(body: Body) -> tuple[np.ndarray, np.ndarray]:
+    """Bones of the mean shape, and what a standard deviation of each component adds to them: (3(J - 1),), (.., S)."""
     parents = body.parents[1:]
     mean = (body.joints[1:] - body.joints[parents]).astype(np.float64)
     directions = (body.joint_directions[:, 1:] - body.joint_directions[:, parents]).astype(np.float64)
-    columns = directions.reshape(len(directions), -1).T
-    ridge = 1e-9 * np.eye(columns.shape[1])
-    error = (bones - mean).ravel()
-    shape = np.linalg.solve(columns.T @ columns + ridge, columns.T @ error)
-    return shape.astype(np.float32), float(np.sqrt(np.square(error - columns @ shape).sum() / len(bones)))
+    return mean.ravel(), directions.reshape(len(directions), -1).T
 
 
-def _human(shape: np.ndarray, apart: float) -> bool:
-    return _furthest(shape) <= _SHAPE_MOST and apart <= _APART_M
-
-
-def _furthest(shape: np.ndarray) -> float:
-    return float(np.abs(shape).max(initial=0))
-
-
-def _alike(body: Body, bones: np.ndarray) -> bool:
-    """Whether bones are the mean body's but for their scale."""
-    mean = (body.joints[1:] - body.joints[body.parents[1:]]).astype(np.float64)
-    scaled = bones * (bones * mean).sum() / max(np.square(bones).sum(), 1e-30)
-    return float(np.sqrt(np.square(scaled - mean).sum() / len(mean))) <= _APART_M
+def _apart(error: np.ndarray) -> float:
+    return float(np.sqrt(3 * np.square(error).mean()))

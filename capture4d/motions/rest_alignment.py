@@ -65,8 +65,8 @@ def _bone(clip: Clip, part: str) -> np.ndarray:
     side, _, limb = part.partition("_")
     bone = clip.bone(part, f"{side}_{_NEXT[limb]}")
     if not np.linalg.norm(bone) > 1e-6 * max(clip.leg, 1e-12):
-        raise InputError(f"expected bones with a length, found none from {part} to {side}_{_NEXT[limb]}".replace("_", " "),
-                         where=clip.path)  # fmt: skip
+        said = f"expected bones with a length, found none from {part} to {side}_{_NEXT[limb]}"
+        raise InputError(said.replace("_", " "), where=clip.path)
     return bone
 
 

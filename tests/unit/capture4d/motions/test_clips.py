@@ -215,7 +215,8 @@ def test_what_the_file_says_wrongly_of_itself_is_told(placed, expected: np.ndarr
 
 
 NAMINGS_OF = {"mixamo": "mixamo", "cmu": "cmu, daz", "lafan": "lafan", "rokoko": "rokoko", "smpl": "smpl",
-              "biped": "biped", "unreal": "unreal", "xsens": "xsens", "motive": "motive", "vicon": "vicon, beat"}  # fmt: skip
+              "biped": "biped", "unreal": "unreal", "xsens": "xsens", "motive": "motive",
+              "vicon": "vicon, beat"}  # fmt: skip
 
 
 @pytest.mark.parametrize("naming", NAMINGS_OF)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,13 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from capture4d.body.anny import load_anny
 from capture4d.body.skinning import pose_frame, with_shape
-from capture4d.body.smpl import SMPL_JOINTS
 from capture4d.errors import InputError
 from capture4d.motions.bvh import Bvh, format_bvh, moved_by_root
 from capture4d.motions.clips import understood
 from capture4d.motions.motion_files import read_motion, resample, write_motion
-from capture4d.motions.retargeting import SMPL_TREE, retarget
-from capture4d.types import Body, Mesh, PoseSequence
+from capture4d.motions.retargeting import retarget
+from capture4d.types import Body, PoseSequence
 
 
 def random_poses(body: Body, seed: int, frames: int = 5) -> PoseSequence:
