@@ -343,7 +343,7 @@ def _number_type(kind: Any) -> np.dtype | None:
     return np.dtype(letter.lstrip("<>=|")).newbyteorder(">" if order == ">" or letter[0] == ">" else "<")
 
 
-_LETTERS = ("f2", "f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "b1")
+_LETTERS = ("f2", "f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")
 
 
 def _is_shape(shape: tuple[Any, ...]) -> bool:

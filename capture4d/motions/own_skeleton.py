@@ -5,8 +5,6 @@ BVH has no unit, and tools that such files pass through scale them, turn them, o
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from capture4d.body.skinning import with_shape
@@ -34,22 +32,24 @@ def poses_of_own_skeleton(
     order = _order(bvh, body)
     if order is None or words.names != "auto" or words.given is not None:
         return None
-    if _untouched(bvh, body):
-        words = replace(words, up=words.up or "y")
-    clip, notes = understood(bvh, words)
-    if clip.anatomy.pelvis != order[0]:
-        return None
+    if _untouched(bvh, body) and not words.up and not words.facing:
+        world, rest = bvh.world_rotations(), bvh.rest_places()
+        root, notes = bvh.translations[:, 0], [*bvh.notes, "Y up, Z forward"]
+    else:
+        clip, notes = understood(bvh, words)
+        world, rest, root = clip.world, clip.rest, clip.pelvis
+        if clip.anatomy.pelvis != order[0]:
+            return None
     parents = np.maximum(body.parents, 0)
-    bones = (clip.rest[order] - clip.rest[order][parents])[1:]
-    fitted = _fitted(body, bones)
+    fitted = _fitted(body, (rest[order] - rest[order][parents])[1:])
     if fitted is None:
         return None
     metres, shape = fitted
     unit = next((name for name, known in _UNITS.items() if known == metres), f"units of {1e3 * metres:.4g} mm")
-    notes = [*notes[:-1], f"{notes[-1]}; this body's own skeleton, in {unit}"]
-    translations = clip.pelvis * metres - with_shape(body, shape).joints[0]
+    notes = [*notes, f"the body's own skeleton, in {unit}"]
+    translations = root * metres - with_shape(body, shape).joints[0]
     poses = PoseSequence(
-        relative(clip.world[:, order], body.parents).astype(np.float32),
+        relative(world[:, order], body.parents).astype(np.float32),
         translations.astype(np.float32),
         shape,
         np.arange(len(translations), dtype=np.int32),

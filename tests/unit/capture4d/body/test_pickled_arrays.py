@@ -27,7 +27,6 @@ FIELDS: dict[str, Any] = {
     "by column": sparse.csc_matrix(PARTS),
     "by entry": sparse.coo_matrix(PARTS),
     "by row, an array": sparse.csr_array(PARTS),
-    "true": np.array([True, False]),
     "a view": RNG.random((6, 4))[::2, ::-1],
     "style": "smpl",
     "count": 3,
