@@ -130,7 +130,16 @@ def understood(bvh: Bvh, words: MotionWords | None = None) -> tuple[Clip, list[s
         raise InputError("expected legs with a length, found none", where=bvh.path)
     axes_said = f"{axis_name(axes[:, 1])} up, {axis_name(axes[:, 2])} forward"
     found = f"joints named as by {anatomy.title}; {axes_said}; {unit_words(clip.leg)}"
-    return clip, [*bvh.notes, found, *([doubt] if doubt and not words.up else [])]
+    doubts = [doubt if not words.up else "", _mirror_doubt(clip)]
+    return clip, [*bvh.notes, found, *filter(None, doubts)]
+
+
+def _mirror_doubt(clip: Clip) -> str:
+    """A world of left-handed axes turns feet backwards, as left and right mistaken for each other do."""
+    limbs = clip.anatomy.limbs
+    feet = [clip.bone(f"{side}_ankle", f"{side}_foot") for side in ("left", "right") if f"{side}_foot" in limbs]
+    backwards = len(feet) == 2 and all(foot[2] < -0.5 * np.linalg.norm(foot) for foot in feet)
+    return "toes point backwards at rest: left and right may be swapped, or the file mirrored" if backwards else ""
 
 
 def unit_words(leg: float) -> str:

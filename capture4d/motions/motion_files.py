@@ -118,7 +118,7 @@ def resample(poses: PoseSequence, fps: float) -> PoseSequence:
 def _from_npz(path: Path, body: Body, words: MotionWords, fps: float | None) -> tuple[PoseSequence, list[str]]:
     with ArrayFile(path) as arrays:
         if "rotations" in arrays or not are_smpl_parameters(arrays):
-            return _own(path, body), []
+            return _own(path, body, words), []
         found = read_smpl_parameters(arrays)
         rest = _Rest.read(arrays)
     rate = found.fps or fps
@@ -131,13 +131,21 @@ def _from_npz(path: Path, body: Body, words: MotionWords, fps: float | None) -> 
     return (rest.put_back(poses) if ours and rest is not None else poses), notes
 
 
-def _own(path: Path, body: Body) -> PoseSequence:
+def _own(path: Path, body: Body, words: MotionWords) -> PoseSequence:
     poses = load_poses(path)
+    if words.up not in (None, "y") or words.facing not in (None, "z"):
+        raise InputError("expected neither --up nor --facing for poses of this project, whose Y is up")
     if poses.joint_names != body.joint_names:
         expected, found = len(body.joint_names), len(poses.joint_names)
         raise InputError(f"expected the body's {expected} joints, found {found} others")
     if not len(poses.frame_ids):
         raise InputError("expected at least one frame, found none")
+    off = np.abs(poses.rotations @ np.swapaxes(poses.rotations, 2, 3) - np.eye(3)).max(axis=(2, 3))
+    wrong = (off > 0.05) | (np.linalg.det(poses.rotations) < 0)
+    if wrong.any():
+        frame, joint = (int(axis[0]) for axis in np.nonzero(wrong))
+        where = f"in frame {poses.frame_ids[frame]}, {poses.joint_names[joint]}"
+        raise InputError(f"expected rotations, found a matrix that is none {where}")
     return poses
 
 

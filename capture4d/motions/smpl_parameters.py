@@ -164,7 +164,8 @@ def _forms(array: np.ndarray) -> Iterator[np.ndarray]:
             yield view
         if len(shape) < 3 and view.size:
             yield from _flat_forms(np.atleast_2d(view))
-    if views[-1].ndim in (2, 3) and views[-1].shape[-1] == 3:  # one frame
+    last = views[-1].shape
+    if (len(last) == 2 and last[1] == 3) or (len(last) == 3 and last[1:] == (3, 3)):  # one frame
         yield views[-1][None]
 
 

@@ -50,7 +50,7 @@ def read(path: Path, text: str | bytes) -> Bvh:
     ("ROOT hips\n{", "{\nROOT hips", "line 2: expected a joint before '{', found none"),
     (BVH[: BVH.index("MOTION")], "HIERARCHY\n", "line 2: expected a joint tree"),
     ("ROOT hips", "ROOT", "line 2: expected the name of a joint, found none"),
-    ("Zrotation Xrotation", "Wrotation Xrotation", "line 5: expected channels such as Xposition and Zrotation, found 'Wr"),
+    ("Zrotation Xrotation", "Wrotation Xrotation", "line 5: expected channels such as Xposition and"),
     ("CHANNELS 6", "CHANNELS 5", "line 5: expected CHANNELS, their number and as many names"),
     ("CHANNELS 6", "CHANNELS six", "line 5: expected CHANNELS, their number"),
     ("CHANNELS 6", "CHANNELS 999999999999999999", "line 5: expected CHANNELS, their number"),
@@ -89,8 +89,11 @@ def test_what_is_one_all_the_same(text: bytes, tmp_path: Path) -> None:
     assert len(found.rotations) == 1
 
 
-@pytest.mark.parametrize("channels", ["Zrotation", "Yrotation Xrotation", "Xrotation Yrotation Xrotation",
-                                      "Zrotation Yrotation Xrotation Zrotation", "Xscale Zrotation Yscale"])  # fmt: skip
+@pytest.mark.parametrize(
+    "channels",
+    ["Zrotation", "Yrotation Xrotation", "Xrotation Yrotation Xrotation", "Xscale Zrotation Yscale",
+     "Zrotation Yrotation Xrotation Zrotation"],
+)  # fmt: skip
 def test_rotations_are_those_of_the_channels_in_their_order(channels: str, tmp_path: Path) -> None:
     words = channels.split()
     values = np.random.default_rng(len(words)).uniform(-170, 170, len(words))
@@ -124,13 +127,11 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     assert found.joint_names == clip.joint_names
     np.testing.assert_allclose(found.rotations.as_matrix(), turns.as_matrix(), atol=1e-7)
     np.testing.assert_allclose(found.translations, clip.translations, atol=1e-6)
-    world = clip.world_rotations()
+    world, local = clip.world_rotations(), turns.as_matrix().reshape(3, 5, 3, 3)
     places = clip.world_places(world)
     for joint, parent in enumerate(parents):
         if parent >= 0:
-            np.testing.assert_allclose(
-                world[:, joint], world[:, parent] @ turns.as_matrix().reshape(3, 5, 3, 3)[:, joint]
-            )
+            np.testing.assert_allclose(world[:, joint], world[:, parent] @ local[:, joint])
             np.testing.assert_allclose(places[:, joint] - places[:, parent], world[:, parent] @ offsets[joint])
 
 

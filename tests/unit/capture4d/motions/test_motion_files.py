@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,11 +14,14 @@ from scipy.spatial.transform import Rotation
 from capture4d.body.anny import load_anny
 from capture4d.body.skinning import pose_frame, with_shape
 from capture4d.errors import InputError
+from capture4d.files.records import save_poses
 from capture4d.motions.bvh import Bvh, format_bvh, moved_by_root
 from capture4d.motions.clips import understood
 from capture4d.motions.motion_files import read_motion, resample, write_motion
 from capture4d.motions.retargeting import retarget
 from capture4d.types import Body, PoseSequence
+from tests.bvh_files import TOOLS, text, walk
+from tests.command_line import fails, run
 
 
 def random_poses(body: Body, seed: int, frames: int = 5) -> PoseSequence:
@@ -228,3 +232,83 @@ def test_poses_have_a_shape_of_finite_numbers() -> None:
     poses = random_poses(load_anny(), 0)
     with pytest.raises(InputError, match=r"PoseSequence\.shape: expected finite numbers"):
         replace(poses, shape=np.array([np.nan], np.float32))
+
+
+def test_rotations_that_are_none_are_named(tmp_path: Path) -> None:
+    body = load_anny()
+    poses = random_poses(body, 2)
+    for wrong in (np.zeros((3, 3)), np.diag([1, 1, -1]), 2 * np.eye(3)):
+        rotations = poses.rotations.copy()
+        rotations[3, 6] = wrong
+        save_poses(tmp_path / "poses.npz", replace(poses, rotations=rotations))
+        with pytest.raises(
+            InputError, match=r"poses\.npz: expected rotations, found a matrix that is none in frame 3, foot"
+        ):
+            read_motion(tmp_path / "poses.npz", body)
+
+
+# --- through the command
+
+
+@pytest.fixture
+def strange(tmp_path: Path) -> Path:
+    """Z up, and joints that nobody would know."""
+    axes = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    base = walk()
+    (tmp_path / "in.bvh").write_text(text(base.called(lambda part: f"q{base.names.index(part)}").in_axes(axes)))
+    given = {part: f"q{base.names.index(part)}" for part in base.names if part not in ("neck1", "neck2", "spine1")}
+    ours = {
+        "spine2": "spine03",
+        "spine3": "spine01",
+        "left_hip": "upperleg01.L",
+        "right_ankle": "foot.R",
+        "pelvis": "root",
+    }
+    given = {ours.get(part, part): name for part, name in given.items()} | {"spine05": f"q{base.names.index('spine1')}"}
+    (tmp_path / "names.json").write_text(json.dumps(given))
+    return tmp_path
+
+
+def test_joints_and_axes_may_be_told(strange: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = strange / "out.npz"
+    assert "--names takes a JSON file" in fails(capsys, "convert-poses", strange / "in.bvh", out)
+    how = ("--names", strange / "names.json", "--up", "z", "--facing", "-y")
+    assert run("convert-poses", strange / "in.bvh", out, *how) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert "Z up, -Y forward; in centimetres" in said[0]
+    assert said[1] == f"6 poses at 30 fps: {out}"
+    (strange / "plain.bvh").write_text(text(walk().called(TOOLS["cmu"])))
+    body = load_anny()
+    found, expected = (centres(body, read_motion(strange / name, body)) for name in ("out.npz", "plain.bvh"))
+    np.testing.assert_allclose(found, expected, atol=1e-3)
+
+
+@pytest.mark.parametrize(("names", "said"), [
+    ("mixxamo", "--names: expected auto, mixamo, cmu,"),
+    ("none.json", "none.json: no such file"),
+    ({"tail": "q1"}, "names.json: expected joints of SMPL or of the built-in body, found 'tail'"),
+    ({"head": 3}, "names.json: expected the name of a joint for 'head'"),
+    ({"head": "q99"}, "in.bvh: expected one joint called 'q99' for head, found none"),
+    (["head"], "names.json: expected a JSON object, our joint: their joint, found list"),
+])  # fmt: skip
+def test_wrong_names_are_one_line(names, said: str, strange: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    if not isinstance(names, str):
+        (strange / "names.json").write_text(json.dumps(names))
+        names = strange / "names.json"
+    assert said in fails(capsys, "convert-poses", strange / "in.bvh", strange / "out.npz", "--names", names)
+    assert not (strange / "out.npz").exists()
+
+
+def test_axes_are_not_told_of_poses_of_ours(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    save_poses(tmp_path / "poses.npz", random_poses(load_anny(), 1))
+    said = fails(capsys, "convert-poses", tmp_path / "poses.npz", tmp_path / "out.npz", "--up", "z")
+    assert "expected neither --up nor --facing" in said
+
+
+def test_what_looks_mirrored_is_told(tmp_path: Path) -> None:
+    base = walk().called(TOOLS["cmu"])
+    flip = np.diag([-1.0, 1, 1])
+    (tmp_path / "in.bvh").write_text(text(base.in_axes(flip)))
+    notes: list[str] = []
+    read_motion(tmp_path / "in.bvh", load_anny(), say=notes.append)
+    assert "the file mirrored" in notes[-1]

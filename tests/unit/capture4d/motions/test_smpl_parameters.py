@@ -201,28 +201,31 @@ def with_row(array: np.ndarray, row: int, value: float) -> np.ndarray:
 MIRROR = matrices(Z) * np.array([-1.0, 1, 1])
 SHEAR = matrices(Z) + np.triu(np.full((3, 3), 0.2), 1)
 GOOD = {"poses": flat(Z), "trans": Z_PLACES, **RATE}
+FINITE, FORM = "expected finite numbers, found NaN or infinity", "expected rotation vectors or matrices of 22 or more"
+RATES = "'mocap_framerate': expected a frame rate from 0.1 to 10000, found"
 WRONG: dict[str, tuple[dict[str, Any], str]] = {
-    "poses of NaN": ({"poses": with_row(flat(Z), 3, np.nan)}, "'poses': expected finite numbers, found NaN or infinity in frame 3 of 7"),
-    "translations of infinity": ({"trans": with_row(Z_PLACES, 5, np.inf)}, "'trans': expected finite numbers, found NaN or infinity in frame 5 of 7"),
+    "poses of NaN": ({"poses": with_row(flat(Z), 3, np.nan)}, f"'poses': {FINITE} in frame 3 of 7"),
+    "translations of infinity": ({"trans": with_row(Z_PLACES, 5, np.inf)}, f"'trans': {FINITE} in frame 5 of 7"),
     "a shape of NaN": ({"betas": with_row(BETAS, 0, np.nan)}, "'betas': expected finite numbers"),
     "no frames": ({"poses": np.zeros((0, 72)), "trans": np.zeros((0, 3))}, "'poses': expected at least one frame"),
-    "too few joints": ({"poses": np.zeros((T, 30))}, "'poses': expected rotation vectors or matrices of 22 or more joints"),
-    "the root is lacking": ({"poses": np.zeros((T, 63))}, "'poses': expected rotation vectors or matrices of 22 or more"),
+    "too few joints": ({"poses": np.zeros((T, 30))}, f"'poses': {FORM} joints"),
+    "the root is lacking": ({"poses": np.zeros((T, 63))}, f"'poses': {FORM}"),
     "six numbers a joint": ({"poses": np.zeros((T, 24, 6))}, "perhaps 6 numbers a joint"),
     "quaternions": ({"poses": np.zeros((T, 24, 4))}, "perhaps quaternions"),
-    "six, flat": ({"poses": np.zeros((T, 144))}, "'poses': expected rotation vectors or matrices of 22 or more"),
+    "six, flat": ({"poses": np.zeros((T, 144))}, f"'poses': {FORM}"),
     "a number": ({"poses": np.float64(3)}, "'poses': expected rotation vectors"),
+    "vectors of another number": ({"poses": np.zeros((24, 4, 3))}, f"'poses': {FORM}"),
     "text": ({"poses": np.array(["a"])}, "'poses': expected numbers, found <U1"),
-    "mirrors": ({"poses": MIRROR}, "'poses': expected rotation matrices, found one that is none in frame 0 of 7, joint 0"),
+    "mirrors": ({"poses": MIRROR}, "found one that is none in frame 0 of 7, joint 0"),
     "shears": ({"poses": SHEAR}, "'poses': expected rotation matrices, found one that is none in frame 0 of 7"),
-    "degrees": ({"poses": np.degrees(flat(Z)) + 90}, "'poses': expected rotation vectors in radians, found one of length"),
-    "fewer translations": ({"trans": Z_PLACES[:4]}, r"'trans': expected translations (7, 3), found an array of shape (4, 3)"),
+    "degrees": ({"poses": np.degrees(flat(Z)) + 90}, "'poses': expected rotation vectors in radians"),
+    "fewer translations": ({"trans": Z_PLACES[:4]}, "translations (7, 3), found an array of shape (4, 3)"),
     "flat translations": ({"trans": Z_PLACES[:, :2]}, "'trans': expected translations (7, 3)"),
-    "a rate of 0": ({"mocap_framerate": 0}, "'mocap_framerate': expected a frame rate from 0.1 to 10000, found 0"),
-    "a rate of NaN": ({"mocap_framerate": np.nan}, "'mocap_framerate': expected a frame rate from 0.1 to 10000, found nan"),
-    "a negative rate": ({"mocap_framerate": -120.0}, "'mocap_framerate': expected a frame rate from 0.1 to 10000, found -120"),
-    "a rate of 1e30": ({"mocap_framerate": 1e30}, "'mocap_framerate': expected a frame rate from 0.1 to 10000, found 1e+30"),
-    "two rates": ({"mocap_framerate": np.array([30.0, 60.0])}, "'mocap_framerate': expected a frame rate from 0.1 to 10000, found float64"),
+    "a rate of 0": ({"mocap_framerate": 0}, f"{RATES} 0"),
+    "a rate of NaN": ({"mocap_framerate": np.nan}, f"{RATES} nan"),
+    "a negative rate": ({"mocap_framerate": -120.0}, f"{RATES} -120"),
+    "a rate of 1e30": ({"mocap_framerate": 1e30}, f"{RATES} 1e+30"),
+    "two rates": ({"mocap_framerate": np.array([30.0, 60.0])}, f"{RATES} float64"),
     "no rate": ({"mocap_framerate": np.zeros(0)}, "'mocap_framerate': expected a frame rate"),
     "a rate in words": ({"mocap_framerate": "fast"}, "'mocap_framerate': expected a frame rate"),
 }  # fmt: skip
@@ -240,8 +243,8 @@ def test_what_is_no_motion_is_one_line_of_the_file(name: str, read, tmp_path: Pa
 @pytest.mark.parametrize(("arrays", "said"), [
     ({"body_pose": flat(Z[:, 1:]), **RATE}, "expected an array 'root_orient' or 'global_orient' beside 'body_pose'"),
     ({"global_orient": Z[:, 0], **RATE}, "expected an array 'pose_body' or 'body_pose' beside 'global_orient'"),
-    ({"global_orient": Z[:4, 0], "body_pose": flat(Z[:, 1:]), **RATE}, "'global_orient': expected rotation vectors or "
-     "matrices of 1 joints in 7 frames"),
+    ({"global_orient": Z[:4, 0], "body_pose": flat(Z[:, 1:]), **RATE},
+     "'global_orient': expected rotation vectors or matrices of 1 joints in 7 frames"),
     ({"poses": np.array([{"a": 1}], object), **RATE}, "damaged array 'poses'"),
     ({"anything": np.zeros(3)}, "expected an array 'rotations'"),
 ])  # fmt: skip
