@@ -29,7 +29,9 @@ AXES: dict[Axis, np.ndarray] = {
     "-x": np.array([-1.0, 0.0, 0.0]), "-y": np.array([0.0, -1.0, 0.0]), "-z": np.array([0.0, 0.0, -1.0]),
 }  # fmt: skip
 _SNAP_DEG = 30.0
-"""A rest pose leans by less than this; one that is further from all axes was turned."""
+"""A trunk leans by less than this at rest; one that is further from all axes was turned."""
+_LEVEL_DEG = 4.0
+"""The same of the line through both hips."""
 _STANDS = 0.8
 """Length of the mean direction from feet to head along an axis, of a clip whose subject stands or walks."""
 _LEG_M = (0.5, 1.3)
@@ -168,12 +170,22 @@ def _rest_frame(rest: np.ndarray, anatomy: Anatomy) -> tuple[np.ndarray, bool]:
     hips = (rest[limbs["left_hip"]] + rest[limbs["right_hip"]]) / 2
     up = _unit(rest[anatomy.neck[0] if anatomy.neck else anatomy.head] - hips, "hips and head")
     left = _unit(rest[limbs["left_hip"]] - rest[limbs["right_hip"]], "left and right hip")
-    left = _unit(left - (left @ up) * up, "left and right hip")
-    frame = np.stack([left, up, np.cross(left, up)], axis=1)
+    frame = _square(left, up)
     turns = Rotation.create_group("O").as_matrix()
     nearest = turns[np.argmax(np.einsum("nab,ab->n", turns, frame))].round()
-    angle = np.degrees(Rotation.from_matrix(nearest.T @ frame).magnitude())
-    return (nearest, True) if angle < _SNAP_DEG else (frame, False)
+    # Trunks lean at rest, hips are level: a hip line that is off all axes was turned.
+    lean = np.degrees(np.arccos(np.clip([up @ nearest[:, 1], left @ nearest[:, 0]], -1, 1)))
+    if lean[0] < _SNAP_DEG and lean[1] < _LEVEL_DEG:
+        return nearest, True
+    feet = (rest[limbs["left_ankle"]] + rest[limbs["right_ankle"]]) / 2
+    tall = rest[anatomy.head] - feet
+    return (_square(left, tall) if tall @ up > 0.9 * np.linalg.norm(tall) else frame), False
+
+
+def _square(left: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Left as it is, up made square to it, and forward, as columns."""
+    up = _unit(up - (up @ left) * left, "hips and head")
+    return np.stack([left, up, np.cross(left, up)], axis=1)
 
 
 def _world_up(places: np.ndarray, anatomy: Anatomy, rest_up: np.ndarray | None) -> tuple[np.ndarray, str]:

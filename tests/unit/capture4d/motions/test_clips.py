@@ -82,6 +82,23 @@ def test_both_keep_all_but_the_heading(turn: int, placed, expected: np.ndarray) 
         assert apart_but_for_heading(found, expected) < MILLIMETRE
 
 
+@pytest.mark.parametrize("turn", [(0, 20, 0), (0, 45, 0), (90, 30, 0), (35, 50, 70), (0, 170, 10)])
+def test_a_skeleton_at_rest_off_all_axes(turn: tuple[float, float, float], placed, expected: np.ndarray) -> None:
+    """Which way is up at rest is then known by a fraction of a degree: the head of this one lies a little in front."""
+    turned = Rotation.from_euler("xyz", turn, degrees=True).as_matrix()
+    assert apart(placed(text(CMU.with_rest(turned))), expected) < 0.01
+
+
+@pytest.mark.parametrize("lean", [-12.0, 8.0])
+def test_a_trunk_that_leans_at_rest_is_still_upright(lean: float, placed, expected: np.ndarray) -> None:
+    """Offsets that lean are how a skeleton is built, and no turn of it."""
+    offsets = CMU.offsets.copy()
+    spine = [joint for joint, name in enumerate(BASE.names) if name in ("spine1", "spine2", "spine3", "neck1")]
+    offsets[spine] = offsets[spine] @ Rotation.from_euler("x", lean, degrees=True).as_matrix().T
+    found = placed(text(replace(CMU, offsets=offsets)))
+    assert apart(found - found[:, :1], expected - expected[:, :1]) < MILLIMETRE
+
+
 @pytest.mark.parametrize("words", [{"up": "z"}, {"up": "z", "facing": "-y"}, {"facing": "-y"}])
 def test_axes_may_be_said(words: dict[str, Any], placed, expected: np.ndarray) -> None:
     axes = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
