@@ -41,7 +41,7 @@ def _scheme(title: str, leg: str, arm: str) -> _Scheme:
 
 
 _HUMANIK = _scheme(
-    "Mixamo, MotionBuilder",
+    "Mixamo, MotionBuilder, CMU",
     "upleg leg foot toebase|toe|forefoot|toes",
     "shoulder|collar|clavicle arm forearm hand|wrist",
 )

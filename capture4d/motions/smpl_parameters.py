@@ -21,11 +21,23 @@ __all__ = ["RATES", "SmplParameters", "are_smpl_parameters", "read_smpl_paramete
 
 JOINTS = 22
 """SMPL's joints that its whole family shares."""
-WHOLE = ("poses", "pose_world", "pose", "fullpose", "full_pose")
+WHOLE = ("poses", "pose_world", "pose", "fullpose", "full_pose", "smpl_poses")
 ROOT = ("root_orient", "global_orient", "poses_root", "root_pose", "pose_root", "orient", "global_rot")
 BODY = ("pose_body", "body_pose", "poses_body", "body_poses")
-PLACE = ("trans_world", "trans", "transl", "translation", "translations", "root_trans", "transl_world", "global_trans")
-SHAPE = ("betas", "shape", "shapes", "beta")
+PLACE = (
+    "trans_world",
+    "trans",
+    "transl",
+    "translation",
+    "translations",
+    "root_trans",
+    "transl_world",
+    "global_trans",
+    "smpl_trans",
+)
+SHAPE = ("betas", "shape", "shapes", "beta", "smpl_betas")
+SCALE = "smpl_scaling"
+"""Of AIST++, whose translations are that many times too long."""
 RATES = ("mocap_framerate", "mocap_frame_rate", "fps", "framerate", "frame_rate", "mocap_fps", "framerate_hz")
 ABOUT_ORIGIN, ABOUT_ORIGIN_PLACE = "rh", "th"
 """EasyMocap's: it turns the posed body about the origin of the world, not about its pelvis."""
@@ -71,6 +83,11 @@ def read_smpl_parameters(arrays: ArrayFile) -> SmplParameters:
     if place is None:
         notes.append("no translations are there: the body stays in its place")
     places = np.zeros((count, 3)) if place is None else _places(arrays, place, count)
+    if (scaling := names.exact(SCALE)) is not None:
+        scale = arrays.number(scaling)
+        if not 0 < scale < math.inf:
+            raise InputError(f"'{scaling}': expected a positive number, found {scale:g}")
+        places = places / scale
     shape = names.first(SHAPE)
     betas = None if shape is None else _betas(arrays, shape, notes)
     return SmplParameters(rotations, places, about_origin, betas, _rate(arrays, names), tuple(notes))
