@@ -19,6 +19,7 @@ import numpy as np
 from capture4d.errors import InputError
 from capture4d.files.atomic import read_json
 from capture4d.files.reading import shortened
+from capture4d.motions.bvh import END_SITE
 
 __all__ = ["NAMINGS", "Anatomy", "bare", "find_anatomy", "named_parts"]
 
@@ -184,6 +185,7 @@ class _Tree:
     def __init__(self, names: Sequence[str], parents: list[int]) -> None:
         self.names, self.parents = names, parents
         self._ways: dict[int, list[int]] = {}
+        self._ends = [joint for joint, name in enumerate(names) if name == END_SITE]
         words = _without_common_prefix([_without_labels(_WORD.findall(bare(name))) for name in names])
         self.sided: dict[tuple[int, str], list[int]] = {}
         """(side, what is left of the name) -> joints."""
@@ -216,6 +218,10 @@ class _Tree:
         counted = [j for word, js in self.unsided.items() if re.match("neck|spine", word) for j in js]
         above = [joint for joint in counted if chest in self.way_up(joint)[1:]]
         return max(above, key=lambda joint: len(self.way_up(joint)), default=None)
+
+    def ends_of(self, joint: int) -> list[int]:
+        """End sites that are taken as joints."""
+        return [end for end in self._ends if self.parents[end] == joint]
 
     def joint_called(self, name: str, part: str) -> int:
         exact = [joint for joint, each in enumerate(self.names) if each == name]
@@ -291,6 +297,8 @@ class _Trial:
             if LIMBS[slot] == "hip":  # some have a joint on the way to it, the hip joint
                 found.sort(key=lambda joint: -len(tree.way_up(joint)))
             joints = [fixed[part]] if part in fixed else [*dict.fromkeys(found)][:6]
+            if not joints and LIMBS[slot] in ("ankle", "wrist"):  # bones whose end is no joint
+                joints = [end for above in choices[-1] if above is not None for end in tree.ends_of(above)]
             if not joints and LIMBS[slot] not in OPTIONAL:
                 self.lacking.append(part)
             may_lack = part not in fixed and (LIMBS[slot] in OPTIONAL or not joints)

@@ -8,10 +8,11 @@ words, channels of any number and order, translations of any joint, a number of 
 from __future__ import annotations
 
 import codecs
+import contextlib
 import math
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from capture4d.errors import InputError
 from capture4d.files.reading import reading, shortened
 
-__all__ = ["Bvh", "format_bvh", "moved_by_root", "read_bvh"]
+__all__ = ["END_SITE", "Bvh", "format_bvh", "moved_by_root", "read_bvh"]
 
 _CHANNEL = re.compile(r"([xyz])[_ ]?(position|translation|pos|rotation|rot|scale|scaling)")
 _KINDS = {"position": "p", "translation": "p", "pos": "p", "rotation": "r", "rot": "r", "scale": "s", "scaling": "s"}
@@ -29,6 +30,10 @@ _COUNT, _TIME = re.compile(r"frames?\s*[:=\s]\s*(.*)", re.I), re.compile(r"frame
 _JOINTS_MOST = 4096
 """A hand has 20 and a face 60; nobody has thousands."""
 _TIME_RANGE_S = (1e-5, 10.0)
+
+
+END_SITE = "End Site"
+"""What an end site is called where it is taken as a joint."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,6 +53,26 @@ class Bvh:
     frame_time_s: float
     notes: tuple[str, ...] = ()
     """What in the file was not as it says of itself."""
+    ends: tuple[tuple[int, tuple[float, ...]], ...] = ()
+    """Where bones without a joint at their end end: joint, offset from it."""
+
+    def with_ends(self) -> Bvh:
+        """The same clip with a joint at each of these ends."""
+        if not self.ends:
+            return self
+        owners, offsets = [joint for joint, _ in self.ends], np.array([offset for _, offset in self.ends])
+        count, frames = len(owners), len(self.translations)
+        local = self.rotations.as_quat().reshape(frames, -1, 4)
+        still = np.tile([0.0, 0.0, 0.0, 1.0], (frames, count, 1))
+        return replace(
+            self,
+            joint_names=(*self.joint_names, *[END_SITE] * count),
+            parents=np.concatenate([self.parents, owners]),
+            offsets=np.concatenate([self.offsets, offsets]),
+            rotations=Rotation.from_quat(np.concatenate([local, still], axis=1).reshape(-1, 4)),
+            translations=np.concatenate([self.translations, np.tile(offsets, (frames, 1, 1))], axis=1),
+            ends=(),
+        )
 
     def world_rotations(self) -> np.ndarray:
         """(T, J, 3, 3) down the joint tree."""
@@ -127,6 +152,7 @@ def _parsed(path: Path, lines: list[str]) -> Bvh:
         translations,
         frame_time,
         tuple(notes),
+        tuple(tree.ends.items()),
     )
 
 
@@ -158,6 +184,8 @@ class _Tree:
     offsets: list[tuple[float, ...]]
     channels: list[list[tuple[str, str]]]
     """Axis and kind (position, rotation, scale) of each."""
+    ends: dict[int, tuple[float, ...]] = field(default_factory=dict)
+    """Joint -> where its end site is from it."""
 
     def add(self, name: str, parent: int) -> int:
         if not name:
@@ -201,8 +229,12 @@ def _joint_tree(lines: list[str]) -> tuple[_Tree, int]:
                         if not stack:
                             raise InputError("expected as many '}' as '{', found one more")
                         stack.pop()
-                    case "offset" if _inside(stack) != _END:
-                        tree.offsets[stack[-1]] = _offset(words)
+                    case "offset":
+                        if _inside(stack) != _END:
+                            tree.offsets[stack[-1]] = _offset(words)
+                        elif len(stack) > 1:
+                            with contextlib.suppress(InputError):  # few files need it
+                                tree.ends[stack[-2]] = _offset(words)
                     case "channels" if _inside(stack) != _END:
                         tree.channels[stack[-1]] = _channels(words)
         except InputError as error:

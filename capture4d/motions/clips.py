@@ -7,6 +7,7 @@ where heads are, seen from feet. Letters: T frames, J joints.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -109,7 +110,7 @@ def understood(bvh: Bvh, words: MotionWords | None = None) -> tuple[Clip, list[s
     """
     words = MotionWords() if words is None else words
     try:
-        anatomy = find_anatomy(bvh.joint_names, bvh.parents, naming=words.names, given=words.given)
+        bvh, anatomy = _with_anatomy(bvh, words)
         rest = bvh.rest_places()
         rest_frame, snapped = _rest_frame(rest, anatomy)
         world = bvh.world_rotations()
@@ -134,6 +135,17 @@ def understood(bvh: Bvh, words: MotionWords | None = None) -> tuple[Clip, list[s
     found = f"joints named as by {anatomy.title}; {axes_said}; {unit_words(clip.leg)}"
     doubts = [doubt if not words.up else "", _mirror_doubt(clip)]
     return clip, [*bvh.notes, found, *filter(None, doubts)]
+
+
+def _with_anatomy(bvh: Bvh, words: MotionWords) -> tuple[Bvh, Anatomy]:
+    """The parts of the skeleton; of one that lacks some, with a joint where its bones end."""
+    try:
+        return bvh, find_anatomy(bvh.joint_names, bvh.parents, naming=words.names, given=words.given)
+    except InputError:
+        whole = bvh.with_ends()
+        with contextlib.suppress(InputError):
+            return whole, find_anatomy(whole.joint_names, whole.parents, naming=words.names, given=words.given)
+        raise
 
 
 def _mirror_doubt(clip: Clip) -> str:

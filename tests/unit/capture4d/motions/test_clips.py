@@ -200,6 +200,34 @@ def test_twist_joints_and_fingers_are_passed_over(placed, expected: np.ndarray) 
     assert apart(placed(text(more)), expected) < MILLIMETRE
 
 
+def without_ends(source: Source, parts: set[str]) -> tuple[Source, dict[str, np.ndarray]]:
+    """A skeleton without its last joints, and where these were from the ones before."""
+    dropped = {joint for joint, part in enumerate(BASE.names) if part in parts}
+    kept = [joint for joint in range(len(BASE.names)) if joint not in dropped]
+    parents = tuple(kept.index(parent) if (parent := source.parents[joint]) >= 0 else -1 for joint in kept)
+    ends = {source.names[source.parents[joint]]: source.offsets[joint] for joint in dropped}
+    names = tuple(source.names[joint] for joint in kept)
+    return replace(source, names=names, parents=parents, offsets=source.offsets[kept],
+                   local=source.local[:, kept]), ends  # fmt: skip
+
+
+@pytest.mark.parametrize("limbs", [{"wrist"}, {"wrist", "foot", "ankle"}])
+@pytest.mark.parametrize("tool", ["cmu", "unreal", "daz", "smpl"])
+def test_hands_and_feet_that_are_no_joints(tool: str, limbs: set[str], light_body: Body, placed, expected) -> None:
+    """Where forearm and shin end in an end site."""
+    parts = {f"{side}_{limb}" for side in ("left", "right") for limb in limbs}
+    source, ends = without_ends(BASE.called(TOOLS[tool]), parts)
+    lines = text(source).splitlines()
+    for joint, end in ends.items():
+        at = next((n for n, line in enumerate(lines) if line == f"JOINT {joint}"), None)
+        if at is not None:
+            at = lines.index("OFFSET 0 0.1 0", at)
+            lines[at] = "OFFSET " + " ".join(map(str, end))
+    found = placed("\n".join(lines))
+    kept = [joint for joint, name in enumerate(light_body.joint_names) if not name.startswith(("wrist", "lowerarm02"))]
+    assert apart(found[:, kept] - found[:, :1], expected[:, kept] - expected[:, :1]) < MILLIMETRE
+
+
 # --- what is doubtful, and what cannot be
 
 
