@@ -103,6 +103,8 @@ _PARTS = {
 _WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
 _LABELS = {"jnt", "joint", "bone", "bind", "jt", "bn", "def", "org", "sk", "mixamorig", "bip", "character", "biped"}
 """Words in a name that say nothing of the part."""
+_NAME_MOST = 120
+"""Letters of a name that are looked at."""
 _HEADS = ("head", "skull", "head1", "headc", "headm", "headx", "chead", "mhead")
 _TURNING = re.compile(r"twist|roll", re.I)
 _SIDE_WORDS = {"left": 0, "l": 0, "lft": 0, "lt": 0, "right": 1, "r": 1, "rgt": 1, "rt": 1}
@@ -186,7 +188,7 @@ class _Tree:
         self.names, self.parents = names, parents
         self._ways: dict[int, list[int]] = {}
         self._ends = [joint for joint, name in enumerate(names) if name == END_SITE]
-        words = _without_common_prefix([_without_labels(_WORD.findall(bare(name))) for name in names])
+        words = _without_common_prefix([_without_labels(_WORD.findall(bare(name)[:_NAME_MOST])) for name in names])
         self.sided: dict[tuple[int, str], list[int]] = {}
         """(side, what is left of the name) -> joints."""
         self.unsided: dict[str, list[int]] = {}

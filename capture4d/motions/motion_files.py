@@ -31,7 +31,7 @@ from capture4d.files.records import load_poses, save_poses
 from capture4d.motions.bvh import Bvh, format_bvh, moved_by_root, read_bvh
 from capture4d.motions.clips import MotionWords, understood
 from capture4d.motions.own_skeleton import poses_of_own_skeleton
-from capture4d.motions.retargeting import is_smpl, retarget
+from capture4d.motions.retargeting import frame_times, is_smpl, retarget
 from capture4d.motions.smpl_motions import AMASS_AXES, on_body, smpl_up, to_smpl
 from capture4d.motions.smpl_parameters import RATES, are_smpl_parameters, read_smpl_parameters
 from capture4d.types import Body, PoseSequence
@@ -73,9 +73,10 @@ def read_motion(
                 poses, notes = _from_npz(path, body, words, fps)
             case other:
                 raise InputError(f"expected a motion file .npz or .bvh, found '{other}'")
+        poses = poses if fps is None else resample(poses, fps)
     for note in notes:
         say(note)
-    return poses if fps is None else resample(poses, fps)
+    return poses
 
 
 def told(path: Path) -> Callable[[str], None]:
@@ -97,7 +98,7 @@ def write_motion(path: Path, body: Body, poses: PoseSequence, *, amass: bool = F
 def resample(poses: PoseSequence, fps: float) -> PoseSequence:
     """Poses at another frame rate, by spherical interpolation; frames are counted from 0."""
     times = (poses.frame_ids - poses.frame_ids[0]) / poses.fps
-    at = np.arange(0, times[-1] + 0.1 / fps, 1 / fps).clip(max=times[-1])
+    at = frame_times(times[-1], fps, len(times)).clip(max=times[-1])
     if len(times) == 1:
         return replace(poses, frame_ids=np.zeros(1, np.int32), fps=fps)
     joints = poses.rotations.shape[1]

@@ -22,7 +22,7 @@ from capture4d.motions.clips import Clip
 from capture4d.motions.rest_alignment import aligned, rest_turns
 from capture4d.types import PoseSequence
 
-__all__ = ["SMPL_ORIGIN", "SMPL_TREE", "as_smpl", "is_smpl", "pose_sequence", "relative", "retarget"]
+__all__ = ["SMPL_ORIGIN", "SMPL_TREE", "as_smpl", "frame_times", "is_smpl", "pose_sequence", "relative", "retarget"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +131,7 @@ def retarget(
     """
     skeleton = _skeleton(shaped)
     duration = (len(clip.world) - 1) * clip.frame_time_s
-    at = np.arange(first_frame / fps, duration + 0.1 / fps, 1 / fps)  # files round their frame time
+    at = frame_times(duration, fps, len(clip.world), first_frame=first_frame)
     if not len(at):
         raise InputError(
             f"expected a clip longer than {first_frame} frames, found {duration * fps:.0f}", where=clip.path
@@ -157,6 +157,20 @@ def retarget(
     path = np.stack([np.interp(at, times, clip.pelvis[:, axis]) for axis in range(3)], axis=1)
     translations = (path - path[0]) @ turn.T * scale if place == "origin" else path * scale - joints[0]
     return pose_sequence(shaped, relative(world_target, parents), fps, translations)
+
+
+def frame_times(duration: float, fps: float, count: int, *, first_frame: int = 0) -> np.ndarray:
+    """Seconds at which a clip of `count` frames is sampled at another rate.
+
+    Raises:
+        InputError: so many more frames that the file's rate, or the wanted one, is none.
+    """
+    most = max(100_000, 100 * count)
+    if not duration * fps < most:
+        raise InputError(
+            f"expected at most {most} frames at {fps:g} fps of a clip of {count}, found {duration * fps:.4g}"
+        )
+    return np.arange(first_frame / fps, duration + 0.1 / fps, 1 / fps)  # files round their frame time
 
 
 def _driven(shaped: ShapedBody, skeleton: _Skeleton, clip: Clip) -> dict[str, np.ndarray]:

@@ -199,6 +199,13 @@ def test_resampling_at_the_same_rate_changes_nothing() -> None:
     np.testing.assert_allclose(doubled.rotations[::2], poses.rotations, atol=1e-6)
 
 
+@pytest.mark.parametrize(("own", "fps"), [(60.0, 1e12), (1e-200, 60.0), (60.0, np.inf)])
+def test_a_rate_that_is_none_asks_for_no_memory(own: float, fps: float, tmp_path: Path) -> None:
+    save_poses(tmp_path / "poses.npz", replace(random_poses(load_anny(), 6), fps=own))
+    with pytest.raises(InputError, match=r"poses\.npz: expected at most 100000 frames"):
+        read_motion(tmp_path / "poses.npz", load_anny(), fps=fps)
+
+
 def test_what_is_no_motion_is_named(tmp_path: Path) -> None:
     body = load_anny()
     with pytest.raises(InputError, match="no such motion file"):
