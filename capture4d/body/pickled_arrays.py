@@ -69,7 +69,8 @@ def read_pickled_arrays(path: Path) -> dict[str, np.ndarray]:
         data = path.read_bytes()
         found = _Machine(data).run()
         if not isinstance(found, dict):
-            raise InputError(f"expected a dictionary of arrays, found {type(found).__name__}")
+            what = f"an object of {found.name}" if isinstance(found, _Object) else type(found).__name__
+            raise InputError(f"expected a dictionary of arrays, found {what}")
         made = _Arrays(len(data))
         arrays = {name: made.array(value) for name, value in found.items()}
         return {name: array for name, array in arrays.items() if array is not None}
