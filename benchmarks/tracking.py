@@ -44,6 +44,7 @@ from capture4d.files.arrays import ArrayFile
 from capture4d.files.atomic import read_json
 from capture4d.files.records import load_poses, save_body, save_poses
 from capture4d.motions.bvh import read_bvh
+from capture4d.motions.clips import understood
 from capture4d.motions.motion_files import read_motion, write_motion
 from capture4d.motions.retargeting import retarget
 from capture4d.tracking.config import TrackingConfig
@@ -118,7 +119,7 @@ def _motions(body: Body, frames: int, mocap: Path) -> Iterator[tuple[int, PoseSe
     rng = np.random.default_rng(0)
     yield 0, scripted_clip(people[0], CLIPS["range-of-motion"], 60.0, frames, rng)
     if mocap.is_file():
-        yield 1, _cut(retarget(people[1], read_bvh(mocap), 60.0, first_frame=120), frames)
+        yield 1, _cut(retarget(people[1], understood(read_bvh(mocap))[0], 60.0, first_frame=120), frames)
     else:
         yield 1, scripted_clip(people[1], CLIPS["reach"], 60.0, frames, rng)
 

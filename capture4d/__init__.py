@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from capture4d.mesh_files.meshes import read_coloured_mesh as read_coloured_mesh
     from capture4d.mesh_files.meshes import read_mesh as read_mesh
     from capture4d.mesh_files.meshes import write_mesh as write_mesh
+    from capture4d.motions.clips import MotionWords as MotionWords
     from capture4d.motions.motion_files import read_motion as read_motion
     from capture4d.motions.motion_files import write_motion as write_motion
     from capture4d.one_shot import load_garment_model as load_garment_model
@@ -59,6 +60,7 @@ claim_names()
 
 _HOMES = {
     "capture4d.body.anny": "load_anny",
+    "capture4d.motions.clips": "MotionWords",
     "capture4d.motions.motion_files": "read_motion write_motion",
     "capture4d.body.skinning": "pose_frame skin unskin with_pose with_shape",
     "capture4d.captures.capture": "Capture read_capture read_scan write_capture_description write_scan",

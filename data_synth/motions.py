@@ -18,6 +18,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from capture4d.body.skinning import ShapedBody, with_pose
 from capture4d.errors import InputError
 from capture4d.motions.bvh import read_bvh
+from capture4d.motions.clips import understood
+from capture4d.motions.motion_files import told
 from capture4d.motions.retargeting import pose_sequence, retarget
 from capture4d.types import PoseSequence
 from data_synth.config import ClipName, MotionConfig
@@ -121,7 +123,10 @@ def make_motion(
     """
     wanted = config.skip_frames + frames
     if config.bvh is not None:
-        poses = retarget(shaped, read_bvh(Path(config.bvh)), fps, first_frame=config.skip_frames)
+        clip, notes = understood(read_bvh(Path(config.bvh)))
+        for note in notes:
+            told(Path(config.bvh))(note)
+        poses = retarget(shaped, clip, fps, first_frame=config.skip_frames)
         if len(poses.frame_ids) < frames:
             raise InputError(
                 f"expected at least {wanted} frames at {fps:g} fps, found {config.skip_frames + len(poses.frame_ids)}",

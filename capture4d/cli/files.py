@@ -16,6 +16,8 @@ from registration.config import MeshRegistrationConfig
 
 __all__ = ["ConvertBody", "ConvertPoses", "ConvertRig", "RegisterMesh", "Template"]
 
+Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
+
 
 @dataclass(frozen=True, kw_only=True)
 class Template:
@@ -122,7 +124,7 @@ class ConvertPoses:
     """Convert a motion between poses.npz, AMASS npz and BVH, retargeted to a body where the skeletons differ."""
 
     input: Annotated[Positional[Path], arg(metavar="IN")]
-    """Motion file, .npz or .bvh; what kind of npz is told by its arrays."""
+    """Motion file, .npz or .bvh: poses.npz, AMASS's or other SMPL parameters, BVH; told by what is in it."""
     output: Annotated[Positional[Path], arg(metavar="OUT")]
     """Motion file to write, .npz or .bvh."""
     body: Path | None = None
@@ -130,15 +132,24 @@ class ConvertPoses:
     format: Literal["poses", "amass"] = "poses"
     """What kind of .npz to write."""
     fps: Positive | None = None
-    """Frame rate of the result; that of the input if absent."""
+    """Frame rate of the result; that of the input if absent. Of an input that tells no rate, its own."""
+    names: str = "auto"
+    """Whose names a BVH's joints have: `auto` finds out; mixamo, cmu, lafan, rokoko, xsens, smpl, biped, unreal, unity,
+    motive, neuron, blender, daz, vicon, makehuman; or a JSON file, our joint: their joint."""
+    up: Axis | None = None
+    """Axis of the input's world that points up, such as z or -y; found if absent."""
+    facing: Axis | None = None
+    """Axis of a BVH's world that becomes our +Z, where bodies face at rest; found if absent."""
 
     def __call__(self) -> int:
         from capture4d.body.anny import load_anny
         from capture4d.files.records import load_body
+        from capture4d.motions.clips import MotionWords
         from capture4d.motions.motion_files import read_motion, write_motion
 
         body = load_body(self.body) if self.body else load_anny()
-        poses = read_motion(self.input, body, fps=self.fps)
+        words = MotionWords.of(self.names, self.up, self.facing)
+        poses = read_motion(self.input, body, fps=self.fps, words=words, say=lambda note: print(f"read: {note}"))
         write_motion(self.output, body, poses, amass=self.format == "amass")
         print(f"{len(poses.frame_ids)} poses at {poses.fps:g} fps: {self.output}")
         return GOOD

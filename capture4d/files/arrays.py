@@ -86,6 +86,9 @@ class ArrayFile:
         except Exception as error:  # zip, zlib and numpy have a dozen for what a damaged file holds
             raise InputError(f"damaged array '{name}' ({one_line(error)})", where=self._path) from error
 
+    def names_of_arrays(self) -> tuple[str, ...]:
+        return tuple(self._members)
+
     def get(self, name: str) -> np.ndarray | None:
         return self[name] if name in self._members else None
 

@@ -1,9 +1,9 @@
-"""Motion from elsewhere and back: this project's npz, AMASS npz, and BVH, each told by what is in the file.
+"""Motion from elsewhere and back: this project's npz, SMPL's parameters in npz, and BVH, each told by what is in it.
 
-own npz    poses.npz as in a capture; as it is
-AMASS npz  `poses` (T, 3 J) axis-angle of SMPL's joints, `trans`, `betas`, frame rate under either name, Z up
-BVH        a file with this body's joints is read as it is, with the shape that its bone lengths show; other skeletons
-           are retargeted (see `retargeting`). Written in centimetres
+own npz          poses.npz as in a capture; as it is
+SMPL parameters  AMASS's arrays, or those of estimators and data sets (see `smpl_parameters`). Written: AMASS's, Z up
+BVH              a file with this body's joints is read as it is, in whatever unit, with the shape that its bone lengths
+                 show; other skeletons are retargeted (see `clips`, `retargeting`). Written in centimetres
 
 Poses of SMPL's joints fit a body of the SMPL family without change (hands beyond the wrist are left out), and other
 bodies by retargeting. What these joints cannot say (a second neck joint, twist bones, hands, another shape space) goes
@@ -13,11 +13,13 @@ arrays alone give. Other readers pass over them; ours puts the difference back.
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Float64
 from scipy.spatial.transform import Rotation, Slerp
 
 from capture4d.body.skinning import ShapedBody, with_shape
@@ -26,41 +28,60 @@ from capture4d.files.arrays import ArrayFile
 from capture4d.files.atomic import write_bytes, write_npz
 from capture4d.files.reading import reading
 from capture4d.files.records import load_poses, save_poses
-from capture4d.motions.bvh import Bvh, format_bvh, read_bvh
-from capture4d.motions.retargeting import SMPL_TREE, as_smpl, retarget
+from capture4d.motions.bvh import Bvh, format_bvh, moved_by_root, read_bvh
+from capture4d.motions.clips import MotionWords, understood
+from capture4d.motions.own_skeleton import poses_of_own_skeleton
+from capture4d.motions.retargeting import frame_times, is_smpl, retarget
+from capture4d.motions.smpl_motions import AMASS_AXES, on_body, smpl_up, to_smpl
+from capture4d.motions.smpl_parameters import RATES, are_smpl_parameters, read_smpl_parameters
 from capture4d.types import Body, PoseSequence
 
-__all__ = ["read_motion", "resample", "write_amass", "write_bvh", "write_motion"]
+__all__ = ["read_motion", "resample", "told", "write_amass", "write_bvh", "write_motion"]
 
 BVH_METRE = 100.0
 """Units of a written BVH in a metre."""
 AMASS_JOINTS = 52
 """SMPL-H: 22 of the body, 15 for each hand."""
-FRAME_RATES = ("mocap_framerate", "mocap_frame_rate")
-Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""Turns AMASS's world, Z up, into ours."""
 
 
-def read_motion(path: Path, body: Body, *, fps: float | None = None) -> PoseSequence:
+def read_motion(
+    path: Path,
+    body: Body,
+    *,
+    fps: float | None = None,
+    words: MotionWords | None = None,
+    say: Callable[[str], None] | None = None,
+) -> PoseSequence:
     """Poses of a body from a motion file, where they are in its world.
 
     Args:
-        fps: resample to this rate; None keeps the file's.
+        fps: resample to this rate; None keeps the file's. Of a file that tells no rate, this is its own.
+        words: what the user says of the file's joints and axes; what is not said is found.
+        say: is given what was found, a line at a time.
     Raises:
         InputError: an unknown kind of file, a damaged one, or joints that have no counterpart in the body.
     """
     if not path.is_file():
         raise InputError("no such motion file", where=path)
+    words, say = words or MotionWords(), say or (lambda _: None)
     # Whether numbers are a motion shows when they are put on the body.
     with reading(path, "motion file"):
         match path.suffix.lower():
             case ".bvh":
-                poses = _from_bvh(read_bvh(path), body)
+                poses, notes = _from_bvh(read_bvh(path), body, words)
             case ".npz":
-                poses = _from_npz(path, body)
+                poses, notes = _from_npz(path, body, words, fps)
             case other:
                 raise InputError(f"expected a motion file .npz or .bvh, found '{other}'")
-    return poses if fps is None else resample(poses, fps)
+        poses = poses if fps is None else resample(poses, fps)
+    for note in notes:
+        say(note)
+    return poses
+
+
+def told(path: Path) -> Callable[[str], None]:
+    """What is found in a motion file, told on the screen beside the work."""
+    return lambda note: print(f"capture4d: {path}: {note}", file=sys.stderr)
 
 
 def write_motion(path: Path, body: Body, poses: PoseSequence, *, amass: bool = False) -> None:
@@ -77,7 +98,7 @@ def write_motion(path: Path, body: Body, poses: PoseSequence, *, amass: bool = F
 def resample(poses: PoseSequence, fps: float) -> PoseSequence:
     """Poses at another frame rate, by spherical interpolation; frames are counted from 0."""
     times = (poses.frame_ids - poses.frame_ids[0]) / poses.fps
-    at = np.arange(0, times[-1] + 0.1 / fps, 1 / fps).clip(max=times[-1])
+    at = frame_times(times[-1], fps, len(times)).clip(max=times[-1])
     if len(times) == 1:
         return replace(poses, frame_ids=np.zeros(1, np.int32), fps=fps)
     joints = poses.rotations.shape[1]
@@ -95,59 +116,38 @@ def resample(poses: PoseSequence, fps: float) -> PoseSequence:
 # --- npz ---------------------------------------------------------------------------------------------------------
 
 
-def _from_npz(path: Path, body: Body) -> PoseSequence:
+def _from_npz(path: Path, body: Body, words: MotionWords, fps: float | None) -> tuple[PoseSequence, list[str]]:
     with ArrayFile(path) as arrays:
-        if "poses" not in arrays:
-            poses = load_poses(path)
-            if poses.joint_names != body.joint_names:
-                expected, found = len(body.joint_names), len(poses.joint_names)
-                raise InputError(f"expected the body's {expected} joints, found {found} others")
-            return poses
-        vectors, trans = arrays.real("poses"), arrays.real("trans")
-        rates = [arrays.number(name) for name in FRAME_RATES if name in arrays]
-        betas = arrays.real("betas") if "betas" in arrays else None
+        if "rotations" in arrays or not are_smpl_parameters(arrays):
+            return _own(path, body, words), []
+        found = read_smpl_parameters(arrays)
         rest = _Rest.read(arrays)
-    if vectors.ndim != 2 or vectors.shape[1] % 3 or vectors.shape[1] < 66 or trans.shape != (len(vectors), 3):
-        found = f"{vectors.shape}, {trans.shape}"
-        raise InputError(f"expected poses (T, 66 or more) and trans (T, 3), found {found}")
-    if not rates:
-        raise InputError(f"expected a frame rate as {' or '.join(FRAME_RATES)}, found none")
-    if not 0 < rates[0] < np.inf:
-        raise InputError(f"expected a positive frame rate, found {rates[0]:g}")
-    wrong = np.flatnonzero(~(np.isfinite(vectors).all(axis=1) & np.isfinite(trans).all(axis=1)))
-    if len(wrong):
-        raise InputError(f"expected finite poses and trans, found NaN or infinity in frame {wrong[0]} of {len(trans)}")
-    vectors = vectors[:, :66].reshape(-1, 22, 3)
-    if rest is None or rest.joint_names != body.joint_names or len(rest.turns) != len(vectors):
-        return _from_smpl(path, body, vectors, trans, betas, rates[0])
-    return rest.put_back(_from_smpl(path, body, vectors, trans, rest.shape, rates[0]))
+    rate = found.fps or fps
+    if rate is None:
+        raise InputError(f"expected a frame rate as {' or '.join(RATES[:3])}, found none; convert-poses --fps tells it")
+    ours = rest is not None and rest.joint_names == body.joint_names and len(rest.turns) == len(found.rotations)
+    axes, notes = (AMASS_AXES, []) if rest is not None else smpl_up(found, words)
+    notes = [*found.notes, *([] if found.fps else [f"no frame rate is there: {rate:g} fps, as told"]), *notes]
+    poses = on_body(path, body, found, axes, rate, shape=rest.shape if ours and rest is not None else None)
+    return (rest.put_back(poses) if ours and rest is not None else poses), notes
 
 
-def _from_smpl(
-    path: Path,
-    body: Body,
-    vectors: Float[np.ndarray, "frames 22 3"],
-    trans: Float[np.ndarray, "frames 3"],
-    betas: Float[np.ndarray, "..."] | None,
-    fps: float,
-) -> PoseSequence:
-    """AMASS's arrays on a body; `betas` are its own shape."""
-    count = len(vectors)
-    rotations = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(count, 22, 3, 3)
-    rotations[:, 0] = Z_UP @ rotations[:, 0]
-    if _is_smpl(body):
-        root = body.joints[0].astype(np.float64)
-        return _for_smpl(body, rotations, trans @ Z_UP.T + _turned_about_origin(root), betas, fps)
-    source = Bvh(
-        path,
-        tuple(SMPL_TREE),
-        np.array([parent for parent, _ in SMPL_TREE.values()]),
-        np.array([offset for _, offset in SMPL_TREE.values()]),
-        Rotation.from_matrix(rotations.reshape(-1, 3, 3)),
-        (trans + SMPL_TREE["pelvis"][1]) @ Z_UP.T,
-        1 / fps,
-    )
-    return retarget(with_shape(body, np.zeros(0, np.float32)), source, fps, place="world")
+def _own(path: Path, body: Body, words: MotionWords) -> PoseSequence:
+    poses = load_poses(path)
+    if words.up not in (None, "y") or words.facing not in (None, "z"):
+        raise InputError("expected neither --up nor --facing for poses of this project, whose Y is up")
+    if poses.joint_names != body.joint_names:
+        expected, found = len(body.joint_names), len(poses.joint_names)
+        raise InputError(f"expected the body's {expected} joints, found {found} others")
+    if not len(poses.frame_ids):
+        raise InputError("expected at least one frame, found none")
+    off = np.abs(poses.rotations @ np.swapaxes(poses.rotations, 2, 3) - np.eye(3)).max(axis=(2, 3))
+    wrong = (off > 0.05) | (np.linalg.det(poses.rotations) < 0)
+    if wrong.any():
+        frame, joint = (int(axis[0]) for axis in np.nonzero(wrong))
+        where = f"in frame {poses.frame_ids[frame]}, {poses.joint_names[joint]}"
+        raise InputError(f"expected rotations, found a matrix that is none {where}")
+    return poses
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -192,54 +192,23 @@ class _Rest:
         }
 
 
-def _is_smpl(body: Body) -> bool:
-    return body.joint_names[:22] == tuple(SMPL_TREE)
-
-
-def _turned_about_origin(root: np.ndarray) -> np.ndarray:
-    """SMPL's root lies off its origin, and turning the world moves it: what that adds to the translation."""
-    return Z_UP @ root - root
-
-
-def _for_smpl(
-    body: Body, rotations: np.ndarray, translations: np.ndarray, betas: np.ndarray | None, fps: float
-) -> PoseSequence:
-    """Poses of SMPL's 22 shared joints on a body of that family; hands stay at rest."""
-    everything = np.tile(np.eye(3), (len(rotations), len(body.joint_names), 1, 1))
-    everything[:, :22] = rotations
-    shape = np.zeros(0) if betas is None else betas.reshape(-1)[: len(body.shape_directions)]
-    return PoseSequence(
-        everything.astype(np.float32),
-        translations.astype(np.float32),
-        shape.astype(np.float32),
-        np.arange(len(rotations), dtype=np.int32),
-        fps,
-        body.joint_names,
-    )
-
-
 def write_amass(path: Path, body: Body, poses: PoseSequence) -> None:
     """Write AMASS's arrays for SMPL-H, Z up, hands at rest, and beside them what these leave out of the poses.
 
     `betas` hold the shape if the body is of the SMPL family.
     """
     betas = np.zeros(16)
-    if _is_smpl(body):
-        rotations = poses.rotations[:, :22].astype(np.float64)
-        trans = (poses.translations - _turned_about_origin(body.joints[0].astype(np.float64))) @ Z_UP
+    if is_smpl(body.joint_names):
         betas[: len(poses.shape)] = poses.shape[:16]
-    else:
-        motion = as_smpl(with_shape(body, poses.shape), poses)
-        rotations = motion.rotations.as_matrix().reshape(-1, 22, 3, 3)
-        trans = motion.root_positions @ Z_UP - SMPL_TREE["pelvis"][1]
-    rotations[:, 0] = Z_UP.T @ rotations[:, 0]
-    vectors = np.zeros((len(rotations), AMASS_JOINTS, 3))
-    vectors[:, :22] = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_rotvec().reshape(-1, 22, 3)
-    plain = _from_smpl(path, body, vectors[:, :22], trans, poses.shape, poses.fps)
+    parameters = to_smpl(body, poses)
+    vectors = np.zeros((len(parameters.rotations), AMASS_JOINTS, 3))
+    turns = Rotation.from_matrix(parameters.rotations.reshape(-1, 3, 3))
+    vectors[:, :22] = turns.as_rotvec().reshape(-1, 22, 3)
+    plain = on_body(path, body, parameters, AMASS_AXES, poses.fps, shape=poses.shape)
     write_npz(
         path,
         poses=vectors.reshape(len(vectors), -1),
-        trans=trans,
+        trans=parameters.places,
         betas=betas,
         gender=np.array("neutral"),
         mocap_framerate=np.float64(poses.fps),
@@ -261,7 +230,7 @@ def write_bvh(path: Path, body: Body, poses: PoseSequence) -> None:
         parents,
         BVH_METRE * offsets,
         Rotation.from_matrix(poses.rotations.reshape(-1, 3, 3).astype(np.float64)),
-        BVH_METRE * (poses.translations + shaped.joints[0]),
+        moved_by_root(BVH_METRE * offsets, BVH_METRE * (poses.translations + shaped.joints[0])),
         1 / poses.fps,
     )
     write_bytes(path, format_bvh(motion, _ends(shaped)).encode())
@@ -275,29 +244,10 @@ def _ends(shaped: ShapedBody) -> np.ndarray:
     return 0.1 * BVH_METRE * along / length
 
 
-def _from_bvh(bvh: Bvh, body: Body) -> PoseSequence:
-    if set(body.joint_names) != set(bvh.joint_names):
-        return retarget(with_shape(body, np.zeros(0, np.float32)), bvh, round(1 / bvh.frame_time_s, 3), place="world")
-    order = [bvh.joint_names.index(name) for name in body.joint_names]
-    shape = _shape_of_bones(body, bvh.offsets[order] / BVH_METRE)
-    rotations = bvh.rotations.as_matrix().reshape(-1, len(order), 3, 3)[:, order]
-    translations = bvh.root_positions / BVH_METRE - with_shape(body, shape).joints[0]
-    return PoseSequence(
-        rotations.astype(np.float32),
-        translations.astype(np.float32),
-        shape,
-        np.arange(len(rotations), dtype=np.int32),
-        round(1 / bvh.frame_time_s, 3),
-        body.joint_names,
-    )
-
-
-def _shape_of_bones(body: Body, offsets: np.ndarray) -> np.ndarray:
-    """The shape whose bones are nearest to the given offsets, (S,) float32."""
-    parents = np.maximum(body.parents[1:], 0)
-    mean = (body.joints[1:] - body.joints[parents]).astype(np.float64)
-    directions = (body.joint_directions[:, 1:] - body.joint_directions[:, parents]).astype(np.float64)
-    columns = directions.reshape(len(directions), -1).T
-    ridge = 1e-9 * np.eye(columns.shape[1])
-    error = (offsets[1:] - mean).ravel()
-    return np.linalg.solve(columns.T @ columns + ridge, columns.T @ error).astype(np.float32)
+def _from_bvh(bvh: Bvh, body: Body, words: MotionWords) -> tuple[PoseSequence, list[str]]:
+    fps = round(1 / bvh.frame_time_s, 3)
+    own = poses_of_own_skeleton(bvh, body, words, fps)
+    if own is not None:
+        return own
+    clip, notes = understood(bvh, words)
+    return retarget(with_shape(body, np.zeros(0, np.float32)), clip, fps, place="world"), notes

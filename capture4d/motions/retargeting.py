@@ -1,68 +1,49 @@
 """Motion from one skeleton to another.
 
-Retargeting copies world rotations relative to the T-pose of the source, joint by joint, after turning each limb of our
-rest pose onto the source's, so that bone lengths and rest poses may differ.
+Retargeting copies world rotations relative to the rest pose of the source, part by part, after turning each limb of our
+rest pose onto the source's, so that bone lengths and rest poses may differ. Spine and neck are shared out: the
+rotation at each share of our spine is that of the source at the same share of its own, between two of its joints by
+spherical interpolation.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
-from pathlib import Path
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Float64
 from scipy.spatial.transform import Rotation, Slerp
 
 from capture4d.body.skinning import ShapedBody, with_pose
 from capture4d.errors import InputError
-from capture4d.motions.bvh import Bvh
+from capture4d.motions.clips import Clip
+from capture4d.motions.rest_alignment import aligned, rest_turns
 from capture4d.types import PoseSequence
 
-__all__ = ["SMPL_TREE", "as_smpl", "pose_sequence", "retarget"]
+__all__ = ["SMPL_ORIGIN", "SMPL_TREE", "as_smpl", "frame_times", "is_smpl", "pose_sequence", "relative", "retarget"]
 
 
 @dataclass(frozen=True, slots=True)
-class _Scheme:
-    """Which joint of a file drives which of ours."""
+class _Skeleton:
+    """What a body that can be moved calls the parts of a person; its other joints follow their parents."""
 
-    drives: dict[str, str]
-    """Our joint -> the file's joint; joints of ours that are not named follow their parent."""
-    limbs: dict[str, str]
-    """Our limb joint -> the file's joint whose offset tells the limb's rest direction."""
+    limbs: Mapping[str, str]
+    """Part -> joint."""
+    spine: tuple[str, ...]
+    neck: tuple[str, ...]
+    pelvis: str
+    head: str
 
-
-def _scheme(
-    trunk: dict[str, str], sides: tuple[str, str], leg: tuple[str, str, str], arm: tuple[str, str, str, str]
-) -> _Scheme:
-    """A scheme that names joints of the limbs by the side and the part.
-
-    Args:
-        trunk: our joint -> the file's joint.
-        sides: what the names of left and right begin with.
-        leg: hip, knee, ankle.
-        arm: collar, shoulder, elbow, wrist.
-    """
-    drives, limbs = dict(trunk), {}
-    for side, word in zip("LR", sides, strict=True):
-        hip, knee, ankle = (word + part for part in leg)
-        collar, shoulder, elbow, wrist = (word + part for part in arm)
-        drives |= {
-            f"upperleg01.{side}": hip,
-            f"lowerleg01.{side}": knee,
-            f"foot.{side}": ankle,
-            f"clavicle.{side}": collar,
-            f"upperarm01.{side}": shoulder,
-            f"lowerarm01.{side}": elbow,
-            f"wrist.{side}": wrist,
-        }
-        limbs |= {
-            f"upperleg01.{side}": knee,
-            f"lowerleg01.{side}": ankle,
-            f"upperarm01.{side}": elbow,
-            f"lowerarm01.{side}": wrist,
-        }
-    return _Scheme(drives, limbs)
+    @property
+    def drives(self) -> dict[str, str]:
+        """Joint -> the part of SMPL that moves it."""
+        trunk = zip(("spine1", "spine2", "spine3"), self.spine, strict=True)
+        return {
+            self.pelvis: "pelvis", self.head: "head", self.neck[0]: "neck", **{joint: part for part, joint in trunk},
+            **{joint: part for part, joint in self.limbs.items()},
+        }  # fmt: skip
 
 
 SMPL_TREE: dict[str, tuple[int, tuple[float, float, float]]] = {
@@ -91,6 +72,9 @@ SMPL_TREE: dict[str, tuple[int, tuple[float, float, float]]] = {
 }
 """SMPL's first 22 joints, which its whole family shares: parent and offset of an adult in a T-pose, rounded, metres."""
 
+SMPL_ORIGIN = (0.0, -0.22, 0.03)
+"""The pelvis of SMPL's mean body at rest from the origin of its file, rounded, metres: translations start there."""
+
 AIMS = {
     "spine1": "spine2", "spine2": "spine3", "spine3": "neck", "neck": "head",
     **{f"{side}_{joint}": f"{side}_{following}" for side in ("left", "right") for joint, following in (
@@ -98,37 +82,44 @@ AIMS = {
 }  # fmt: skip
 """The joint that each joint of SMPL's chains carries next."""
 
-SCHEMES = (
-    _scheme(
-        {"root": "pelvis", "spine05": "spine1", "spine03": "spine2", "spine01": "spine3",
-         "neck01": "neck", "head": "head"},
-        ("left_", "right_"), leg=("hip", "knee", "ankle"), arm=("collar", "shoulder", "elbow", "wrist"),
-    ),
-    _scheme(
-        {"root": "Hips", "spine05": "LowerBack", "spine03": "Spine", "spine01": "Spine1",
-         "neck01": "Neck", "neck02": "Neck1", "head": "Head"},
-        ("Left", "Right"), leg=("UpLeg", "Leg", "Foot"), arm=("Shoulder", "Arm", "ForeArm", "Hand"),
-    ),
-    _scheme(
-        {"root": "Hips", "spine05": "lowerback", "spine03": "Chest", "spine01": "Chest2",
-         "neck01": "lowerneck", "neck02": "Neck", "head": "Head"},
-        ("Left", "Right"), leg=("Hip", "Knee", "Ankle"), arm=("Collar", "Shoulder", "Elbow", "Wrist"),
-    ),
+_LIMBS = {"hip": "upperleg01", "knee": "lowerleg01", "ankle": "foot", "collar": "clavicle", "shoulder": "upperarm01",
+          "elbow": "lowerarm01", "wrist": "wrist"}  # fmt: skip
+_BUILT_IN = _Skeleton(
+    {f"{side}_{part}": f"{joint}.{letter}" for side, letter in (("left", "L"), ("right", "R"))
+     for part, joint in _LIMBS.items()},
+    ("spine05", "spine03", "spine01"), ("neck01", "neck02"), "root", "head",
 )  # fmt: skip
-"""SMPL's naming, and the two of the CMU Graphics Lab database."""
+_SMPL = _Skeleton(
+    {f"{side}_{part}": f"{side}_{part}" for side in ("left", "right") for part in _LIMBS},
+    ("spine1", "spine2", "spine3"), ("neck",), "pelvis", "head",
+)  # fmt: skip
 
-LIMB_ENDS = {"upperleg01": "lowerleg01", "lowerleg01": "foot", "upperarm01": "lowerarm01", "lowerarm01": "wrist"}
+
+def is_smpl(joint_names: Sequence[str]) -> bool:
+    return tuple(joint_names[:22]) == tuple(SMPL_TREE)
+
+
+def _skeleton(shaped: ShapedBody) -> _Skeleton:
+    """Of a body; it has every limb.
+
+    Raises:
+        InputError: the body lacks some of them.
+    """
+    names = shaped.body.joint_names
+    found = _SMPL if is_smpl(names) else _BUILT_IN
+    _require_joints(shaped, [joint for part, joint in found.limbs.items() if not part.endswith("collar")])
+    return found
 
 
 def retarget(
     shaped: ShapedBody,
-    bvh: Bvh,
+    clip: Clip,
     fps: float,
     *,
     first_frame: int = 0,
     place: Literal["origin", "world"] = "origin",
 ) -> PoseSequence:
-    """Move a person like a BVH clip.
+    """Move a person like a clip.
 
     Resampled to `fps` by spherical interpolation, scaled by leg length, feet on the floor.
 
@@ -136,79 +127,125 @@ def retarget(
         first_frame: where to start, in frames of the result.
         place: `origin` turns the clip to face +Z and starts it above the origin; `world` leaves it where it is.
     Raises:
-        InputError: the file's joint names follow none of the known schemes, or the body lacks limbs that it drives.
+        InputError: the clip is shorter, or the body lacks limbs that it drives.
     """
-    scheme = _match(bvh)
-    _require_joints(shaped, {*scheme.limbs, "foot.L"})
-    world = bvh.world_rotations()
-    duration = (len(world) - 1) * bvh.frame_time_s
-    at = np.arange(first_frame / fps, duration + 0.1 / fps, 1 / fps)  # files round their frame time
+    skeleton = _skeleton(shaped)
+    duration = (len(clip.world) - 1) * clip.frame_time_s
+    at = frame_times(duration, fps, len(clip.world), first_frame=first_frame)
     if not len(at):
         raise InputError(
-            f"expected a clip longer than {first_frame} frames, found {duration * fps:.0f}", where=bvh.path
+            f"expected a clip longer than {first_frame} frames, found {duration * fps:.0f}", where=clip.path
         )
-    times = np.arange(len(world)) * bvh.frame_time_s
-    index = {name: slot for slot, name in enumerate(bvh.joint_names)}
-    names, joints, parents = shaped.body.joint_names, shaped.joints, shaped.body.parents
+    times = np.arange(len(clip.world)) * clip.frame_time_s
+    joints, parents = shaped.joints, shaped.body.parents
     turn = np.eye(3)
     if place == "origin":
-        facing = world[round(first_frame / fps / bvh.frame_time_s), index[scheme.drives["root"]]][:, 2]
+        facing = clip.world[round(first_frame / fps / clip.frame_time_s), clip.anatomy.pelvis, :, 2]
         turn = Rotation.from_euler("y", -np.arctan2(facing[0], facing[2])).as_matrix()
 
-    world_target = np.empty((len(at), len(names), 3, 3))
-    for joint, name in enumerate(names):
-        if name not in scheme.drives:
+    driven = _driven(shaped, skeleton, clip)
+    world_target = np.empty((len(at), len(joints), 3, 3))
+    for joint, name in enumerate(shaped.body.joint_names):
+        if name not in driven:
             world_target[:, joint] = world_target[:, parents[joint]]
             continue
-        path = Rotation.from_matrix(world[:, index[scheme.drives[name]]])
+        path = Rotation.from_matrix(driven[name])
         if len(times) > 1:
             path = Slerp(times, path)(np.clip(at, 0, times[-1]))
-        world_target[:, joint] = turn @ path.as_matrix() @ _limb_alignment(shaped, scheme, bvh, name)
-    scale = _leg(shaped) / _source_leg(scheme, bvh)
-    path = np.stack([np.interp(at, times, bvh.root_positions[:, axis]) for axis in range(3)], axis=1)
+        world_target[:, joint] = turn @ path.as_matrix()
+    scale = _leg(shaped, skeleton) / clip.leg
+    path = np.stack([np.interp(at, times, clip.pelvis[:, axis]) for axis in range(3)], axis=1)
     translations = (path - path[0]) @ turn.T * scale if place == "origin" else path * scale - joints[0]
-    return pose_sequence(shaped, _relative(world_target, parents), fps, translations)
+    return pose_sequence(shaped, relative(world_target, parents), fps, translations)
 
 
-def as_smpl(shaped: ShapedBody, poses: PoseSequence) -> Bvh:
+def frame_times(duration: float, fps: float, count: int, *, first_frame: int = 0) -> np.ndarray:
+    """Seconds at which a clip of `count` frames is sampled at another rate.
+
+    Raises:
+        InputError: so many more frames that the file's rate, or the wanted one, is none.
+    """
+    most = max(100_000, 100 * count)
+    if not duration * fps < most:
+        raise InputError(
+            f"expected at most {most} frames at {fps:g} fps of a clip of {count}, found {duration * fps:.4g}"
+        )
+    return np.arange(first_frame / fps, duration + 0.1 / fps, 1 / fps)  # files round their frame time
+
+
+def _driven(shaped: ShapedBody, skeleton: _Skeleton, clip: Clip) -> dict[str, np.ndarray]:
+    """World rotations (T, 3, 3) of the joints that the clip moves, by name."""
+    anatomy, world = clip.anatomy, clip.world
+    spine = _shared(world, anatomy.pelvis, anatomy.spine, len(skeleton.spine))
+    # Without a joint of its own, the neck takes its part of how the head is turned from the chest.
+    through = anatomy.neck or (anatomy.head,)
+    neck = _shared(world, anatomy.chest, through, len(skeleton.neck) + (not anatomy.neck))
+    driven = {skeleton.pelvis: world[:, anatomy.pelvis], skeleton.head: world[:, anatomy.head]}
+    driven |= dict(zip(skeleton.spine, spine, strict=True)) | dict(zip(skeleton.neck, neck, strict=False))
+    turns = rest_turns(clip, _rest_bones(shaped, skeleton))
+    for part, name in skeleton.limbs.items():
+        if part in anatomy.limbs:
+            driven[name] = world[:, anatomy.limbs[part]] @ turns[part]
+    return driven
+
+
+def _shared(world: np.ndarray, base: int, chain: Sequence[int], count: int) -> list[np.ndarray]:
+    """Rotations (T, 3, 3) at `count` equal shares of a chain of joints, from above its base to its end."""
+    if not chain:
+        return [world[:, base]] * count
+    known = [base, *chain]
+    shares = []
+    for place in np.arange(1, count + 1) * len(chain) / count:
+        before = min(int(place), len(chain) - 1)
+        part, start = place - before, world[:, known[before]]
+        if part in (0.0, 1.0):
+            shares.append(world[:, known[before + int(part)]])
+            continue
+        step = Rotation.from_matrix(np.swapaxes(start, 1, 2) @ world[:, known[before + 1]]).as_rotvec()
+        shares.append(start @ Rotation.from_rotvec(part * step).as_matrix())
+    return shares
+
+
+def _rest_bones(shaped: ShapedBody, skeleton: _Skeleton) -> dict[str, np.ndarray]:
+    """Part of a limb -> from it to the next one at rest."""
+    names = shaped.body.joint_names
+    places = {part: shaped.joints[names.index(name)] for part, name in skeleton.limbs.items() if name in names}
+    return {part: places[AIMS[part]] - places[part] for part in places if part in AIMS}
+
+
+def as_smpl(shaped: ShapedBody, poses: PoseSequence) -> tuple[Float64[np.ndarray, "frames 22 3 3"], np.ndarray]:
     """The inverse of `retarget` onto SMPL's first 22 joints, in the world of the poses.
 
     What lies between two joints that SMPL knows, such as every second joint of our spine, is summed up in the next;
     each joint then turns the least that points it at where the next one really is.
+
+    Returns:
+        Local rotations, and where the pelvis is, (T, 3).
     """
+    skeleton, tree = _skeleton(shaped), list(SMPL_TREE)
+    _require_joints(shaped, skeleton.drives)
     names = list(shaped.body.joint_names)
-    scheme, tree = SCHEMES[0], list(SMPL_TREE)
-    _require_joints(shaped, scheme.drives)
-    source = Bvh(
-        Path("SMPL"),
-        tuple(tree),
-        np.array([parent for parent, _ in SMPL_TREE.values()]),
-        np.array([offset for _, offset in SMPL_TREE.values()]),
-        Rotation.identity(len(poses.rotations) * len(tree)),
-        np.zeros((len(poses.rotations), 3)),
-        1 / poses.fps,
-    )
     ours, centres = _world(shaped, poses)
-    driver = {theirs: mine for mine, theirs in scheme.drives.items()}
+    driver = {part: joint for joint, part in skeleton.drives.items()}
+    bones = _rest_bones(shaped, skeleton)
     world = np.empty((len(ours), len(tree), 3, 3))
-    for joint, name in enumerate(tree):
-        if name not in driver:
-            world[:, joint] = world[:, source.parents[joint]]
+    for joint, part in enumerate(tree):
+        if part not in driver:
+            world[:, joint] = world[:, SMPL_TREE[part][0]]
             continue
-        alignment = _limb_alignment(shaped, scheme, source, driver[name])
-        mine = names.index(driver[name])
-        world[:, joint] = ours[:, mine] @ alignment.T
-        if name in AIMS:
-            aim = names.index(driver[AIMS[name]])
+        mine = names.index(driver[part])
+        bone = part.replace("wrist", "elbow")  # a hand goes with its arm
+        if bone.endswith(("hip", "knee", "shoulder", "elbow")):
+            world[:, joint] = ours[:, mine] @ aligned(bones[bone], np.array(SMPL_TREE[AIMS[bone]][1])).T
+        else:
+            world[:, joint] = ours[:, mine]
+        if part in AIMS:
+            aim = names.index(driver[AIMS[part]])
             expected = ours[:, mine] @ (shaped.joints[aim] - shaped.joints[mine])
             world[:, joint] = _smallest_turns(expected, centres[:, aim] - centres[:, mine]) @ world[:, joint]
-    scale = _leg(shaped) / _source_leg(scheme, source)
-    local = _relative(world, source.parents)
-    return replace(
-        source,
-        rotations=Rotation.from_matrix(local.reshape(-1, 3, 3)),
-        root_positions=(poses.translations + shaped.joints[0]) / scale,
-    )
+    leg = sum(float(np.linalg.norm(SMPL_TREE[part][1])) for part in ("left_knee", "left_ankle"))
+    parents = np.array([parent for parent, _ in SMPL_TREE.values()])
+    return relative(world, parents), (poses.translations + shaped.joints[0]) * leg / _leg(shaped, skeleton)
 
 
 def _require_joints(shaped: ShapedBody, names: Iterable[str]) -> None:
@@ -252,7 +289,7 @@ def pose_sequence(
     )
 
 
-def _relative(world: np.ndarray, parents: np.ndarray) -> np.ndarray:
+def relative(world: np.ndarray, parents: np.ndarray) -> np.ndarray:
     """World rotations (T, J, 3, 3) relative to their parents'."""
     local = world.copy()
     for joint, parent in enumerate(parents):
@@ -261,47 +298,10 @@ def _relative(world: np.ndarray, parents: np.ndarray) -> np.ndarray:
     return local
 
 
-def _limb_alignment(shaped: ShapedBody, scheme: _Scheme, bvh: Bvh, name: str) -> np.ndarray:
-    """Turns our limb in its rest pose onto the source's; the identity for what is no limb. A hand goes with its arm."""
-    name = name.replace("wrist", "lowerarm01")
-    if name not in scheme.limbs:
-        return np.eye(3)
-    names = shaped.body.joint_names
-    stem, side = name.split(".")
-    ours = shaped.joints[names.index(f"{LIMB_ENDS[stem]}.{side}")] - shaped.joints[names.index(name)]
-    return _align(ours, bvh.offsets[bvh.joint_names.index(scheme.limbs[name])])
-
-
-def _leg(shaped: ShapedBody) -> float:
+def _leg(shaped: ShapedBody, skeleton: _Skeleton) -> float:
     """Thigh and shin, metres."""
-    hip, knee, ankle = (
-        shaped.joints[shaped.body.joint_names.index(f"{name}.L")] for name in ("upperleg01", "lowerleg01", "foot")
-    )
-    return float(np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee))
-
-
-def _source_leg(scheme: _Scheme, bvh: Bvh) -> float:
-    """The same of the source, in its unit."""
-    ends = (scheme.limbs["upperleg01.L"], scheme.limbs["lowerleg01.L"])
-    return float(sum(np.linalg.norm(bvh.offsets[bvh.joint_names.index(name)]) for name in ends))
-
-
-def _match(bvh: Bvh) -> _Scheme:
-    have = set(bvh.joint_names)
-    missing = [sorted(set(scheme.drives.values()) - have) for scheme in SCHEMES]
-    best = int(np.argmin([len(each) for each in missing]))
-    if missing[best]:
-        lacking = ", ".join(missing[best][:4])
-        raise InputError(
-            f"expected joints named as in SMPL or the CMU database, found none called {lacking}", where=bvh.path
-        )
-    return SCHEMES[best]
-
-
-def _align(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """The smallest rotation, (3, 3), that turns one direction onto another."""
-    unit = np.stack([target / np.linalg.norm(target), source / np.linalg.norm(source)])
-    return Rotation.align_vectors(unit[:1], unit[1:])[0].as_matrix()
+    bones = _rest_bones(shaped, skeleton)
+    return float(np.linalg.norm(bones["left_hip"]) + np.linalg.norm(bones["left_knee"]))
 
 
 def _smallest_turns(source: np.ndarray, target: np.ndarray) -> np.ndarray:

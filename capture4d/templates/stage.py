@@ -13,7 +13,7 @@ from capture4d.errors import InputError
 from capture4d.files.atomic import file_digest
 from capture4d.files.records import load_body, save_garment
 from capture4d.mesh_files.meshes import read_mesh
-from capture4d.motions.motion_files import read_motion
+from capture4d.motions.motion_files import read_motion, told
 from capture4d.runs.stage import StageResult
 from capture4d.templates.body_regions import body_region
 from capture4d.templates.config import TEMPLATE, TemplateConfig
@@ -73,7 +73,7 @@ def run(
 def _posed(body: Body, poses: Path | None, frame: int | None) -> PosedBody:
     if poses is None:
         return _at_rest(body, np.zeros(0, np.float32))
-    motion = read_motion(poses, body)
+    motion = read_motion(poses, body, say=told(poses))
     try:
         row = 0 if frame is None else motion.row(frame)
     except InputError as error:

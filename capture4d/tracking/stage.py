@@ -36,7 +36,7 @@ from capture4d.files.atomic import (
     write_npz,
 )
 from capture4d.files.records import load_body, save_body, save_poses
-from capture4d.motions.motion_files import read_motion
+from capture4d.motions.motion_files import read_motion, told
 from capture4d.runs.stage import Stage, StageResult, open_stage
 from capture4d.runs.workers import progress, run_jobs
 from capture4d.tracking.config import SequenceConfig, TrackingConfig
@@ -179,7 +179,8 @@ def _start(tracker: Tracker, config: TrackingConfig, frame_id: int) -> BodyState
     rest = tracker.model.rest_state()
     if config.start == "rest":
         return rest
-    poses = read_motion(Path(config.start), tracker.model.body)
+    start = Path(config.start)
+    poses = read_motion(start, tracker.model.body, say=told(start))
     row = poses.row(frame_id) if frame_id in poses.frame_ids else 0
     shape = np.zeros_like(rest.shape)
     shape[: len(poses.shape)] = poses.shape[: len(shape)]

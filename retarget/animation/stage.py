@@ -24,7 +24,7 @@ from capture4d.errors import InputError
 from capture4d.files.arrays import map_array
 from capture4d.files.atomic import file_digest, read_json, write_json, write_json_lines, write_npy, write_npz
 from capture4d.files.records import load_body, load_poses, save_body, save_garment, save_poses
-from capture4d.motions.motion_files import read_motion, resample
+from capture4d.motions.motion_files import read_motion, resample, told
 from capture4d.runs.stage import Stage, StageResult, open_stage
 from capture4d.runs.workers import run_jobs
 from capture4d.types import PoseSequence
@@ -177,7 +177,7 @@ def _own_shape(body: Path) -> np.ndarray:
 
 def _motion(known: GarmentModel, path: Path, person: ShapedBody) -> PoseSequence:
     """The motion at the model's rate, on the person."""
-    poses = read_motion(path, person.body)
+    poses = read_motion(path, person.body, say=told(path))
     try:
         require_motion(known.model, poses)
     except InputError as error:

@@ -46,7 +46,7 @@ from capture4d.files.records import (
 )
 from capture4d.files.tensors import read_tensors, write_tensors
 from capture4d.mesh_files.meshes import read_coloured_mesh, write_mesh
-from capture4d.motions.bvh import Bvh, format_bvh
+from capture4d.motions.bvh import Bvh, format_bvh, moved_by_root
 from capture4d.motions.motion_files import read_motion, write_amass, write_bvh
 from capture4d.types import BlendshapeModel, Body, Garment, GarmentScan, Mesh, PoseSequence, Rig
 from data_synth.mesh_sequence import open_sequence
@@ -187,7 +187,8 @@ def other_bvh(path: Path) -> None:
     parents, offsets = np.array([-1, *range(len(names) - 1)]), RNG.random((len(names), 3))
     from scipy.spatial.transform import Rotation
 
-    motion = Bvh(path, names, parents, offsets, Rotation.from_matrix(rotations), np.zeros((2, 3)), 0.01)
+    places = moved_by_root(offsets, np.zeros((2, 3)))
+    motion = Bvh(path, names, parents, offsets, Rotation.from_matrix(rotations), places, 0.01)
     path.write_text(format_bvh(motion, np.ones((len(names), 3))))
 
 

@@ -11,7 +11,9 @@ from scipy.spatial.transform import Rotation
 from capture4d.body.skinning import ShapedBody, pose_frame
 from capture4d.errors import InputError
 from capture4d.motions.bvh import read_bvh
+from capture4d.motions.clips import understood
 from capture4d.motions.retargeting import retarget
+from capture4d.types import PoseSequence
 from data_synth.config import MotionConfig
 from data_synth.motions import SPINE_LIMITS, arms_enter_trunk, make_motion
 
@@ -55,6 +57,10 @@ def write_bvh(path: Path, rows: list[list[float]]) -> Path:
     return path
 
 
+def retargeted(person: ShapedBody, path: Path) -> PoseSequence:
+    return retarget(person, understood(read_bvh(path))[0], 60.0)
+
+
 @pytest.mark.parametrize("clip", ["range-of-motion", "twist", "reach", "side-bend", "sampled"])
 def test_clips_are_smooth_rotations_on_the_floor(person: ShapedBody, clip) -> None:
     poses = make_motion(person, MotionConfig(clip), 60.0, 90, np.random.default_rng(0))
@@ -96,8 +102,7 @@ def test_arms_in_the_trunk_are_noticed(person: ShapedBody) -> None:
 
 
 def test_bvh_of_a_t_pose_holds_the_arms_out(person: ShapedBody, tmp_path: Path) -> None:
-    clip = read_bvh(write_bvh(tmp_path / "t.bvh", [[0.0] * 6] * 7))
-    poses = retarget(person, clip, 60.0)
+    poses = retargeted(person, write_bvh(tmp_path / "t.bvh", [[0.0] * 6] * 7))
     assert len(poses.frame_ids) == 4  # seven frames at 120 a second
     posed = pose_frame(person, poses, 0)
     names = person.body.joint_names
@@ -111,7 +116,7 @@ def test_bvh_of_a_t_pose_holds_the_arms_out(person: ShapedBody, tmp_path: Path) 
 def test_bvh_is_turned_to_face_forward_and_scaled(person: ShapedBody, tmp_path: Path) -> None:
     walk = [[0.0, 15.0, 0.1 * t, 0.0, 0.0, 0.0] for t in range(61)]
     turned = [[row[2], row[1], -row[0], 0.0, 90.0, 0.0] for row in walk]  # the same walk, towards +X
-    poses = [retarget(person, read_bvh(write_bvh(tmp_path / "w.bvh", rows)), 60.0) for rows in (walk, turned)]
+    poses = [retargeted(person, write_bvh(tmp_path / "w.bvh", rows)) for rows in (walk, turned)]
     np.testing.assert_allclose(poses[0].translations, poses[1].translations, atol=1e-5)
     np.testing.assert_allclose(poses[0].rotations, poses[1].rotations, atol=1e-5)
     names, joints = person.body.joint_names, person.joints
@@ -125,7 +130,7 @@ def test_bvh_is_turned_to_face_forward_and_scaled(person: ShapedBody, tmp_path: 
     [
         (lambda text: text.replace("MOTION", "NOTION"), "expected a MOTION section"),
         (lambda text: text.rsplit(" ", 3)[0], "line"),
-        (lambda text: text.replace("LeftArm", "Tentacle"), "none called LeftArm"),
+        (lambda text: text.replace("LeftArm", "Tentacle"), "none for left shoulder (arm)"),
         (lambda text: text.replace("OFFSET 0 0 0", "OFFSET 0 zero 0", 1), "line 4"),
     ],
 )
@@ -133,7 +138,7 @@ def test_damaged_bvh_is_refused_by_name(person: ShapedBody, tmp_path: Path, dama
     path = write_bvh(tmp_path / "bad.bvh", [[0.0] * 6] * 3)
     path.write_text(damage(path.read_text()))
     with pytest.raises(InputError, match=r"bad\.bvh") as caught:
-        retarget(person, read_bvh(path), 60.0)
+        retargeted(person, path)
     assert message in str(caught.value)
 
 

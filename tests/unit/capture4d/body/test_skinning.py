@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import pickle
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from capture4d.body.skinning import skin, unskin, with_pose, with_shape
-from capture4d.body.smpl import read_smpl
 from capture4d.errors import InputError
-from capture4d.files.atomic import write_npz
-from capture4d.motions.retargeting import SMPL_TREE
 from capture4d.types import Body, Mesh
 
 
@@ -89,78 +84,6 @@ def test_too_many_shape_coefficients_are_refused() -> None:
         with_shape(make_body(), np.zeros(4))
 
 
-def smpl_fields(seed: int = 0, joints: int = 24) -> dict[str, np.ndarray]:
-    rng, verts = np.random.default_rng(seed), 30
-    weights = rng.dirichlet(np.ones(joints), verts)
-    return {
-        "v_template": rng.normal(size=(verts, 3)),
-        "shapedirs": rng.normal(size=(verts, 3, 10)),
-        "posedirs": 0.01 * rng.normal(size=(verts, 3, 9 * (joints - 1))),
-        "J_regressor": rng.dirichlet(np.ones(verts), joints),
-        "weights": weights,
-        "kintree_table": np.stack([np.concatenate([[2**32 - 1], np.arange(joints - 1)]), np.arange(joints)]),
-        "f": rng.integers(0, verts, (20, 3)),
-    }
-
-
-def test_smpl_npz_and_pickle_give_the_same_body(tmp_path: Path) -> None:
-    fields = smpl_fields()
-    write_npz(tmp_path / "body.npz", **fields)
-    (tmp_path / "body.pkl").write_bytes(pickle.dumps(fields, protocol=2))
-    first, second = read_smpl(tmp_path / "body.npz"), read_smpl(tmp_path / "body.pkl")
-    np.testing.assert_array_equal(first.joints, second.joints)
-    shaped = with_shape(first, np.full(10, 0.3))
-    expected = fields["v_template"] + fields["shapedirs"] @ np.full(10, 0.3)
-    np.testing.assert_allclose(shaped.vertices, expected, atol=1e-5)
-    np.testing.assert_allclose(shaped.joints, fields["J_regressor"] @ expected, atol=1e-5)
-
-
-def test_smpl_pose_correctives_vanish_at_rest_and_act_elsewhere(tmp_path: Path) -> None:
-    fields = smpl_fields()
-    write_npz(tmp_path / "body.npz", **fields)
-    body = read_smpl(tmp_path / "body.npz")
-    shaped = with_shape(body, np.zeros(0))
-    identity = np.repeat(np.eye(3)[None], 24, axis=0)
-    np.testing.assert_allclose(with_pose(shaped, identity, np.zeros(3)).vertices(), shaped.vertices, atol=1e-12)
-    pose = some_pose(body, 0.3)
-    posed = with_pose(shaped, pose, np.zeros(3))
-    offset = fields["posedirs"] @ (pose[1:] - np.eye(3)).ravel()
-    expected = skin(shaped.vertices + offset, body.skin_weights, posed.transforms)
-    np.testing.assert_allclose(posed.vertices(), expected, atol=1e-6)
-
-
-class _Payload:
-    def __reduce__(self):  # what a hostile pickle would do
-        return (Path.touch, (Path("owned"),))
-
-
-def test_pickle_with_anything_but_arrays_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "body.pkl").write_bytes(pickle.dumps({**smpl_fields(), "extra": _Payload()}))
-    with pytest.raises(InputError, match=r"body\.pkl: expected only arrays in the pickle, found"):
-        read_smpl(tmp_path / "body.pkl")
-    assert not (tmp_path / "owned").exists()
-
-
-@pytest.mark.parametrize(("joints", "last"), [(24, "right_hand"), (52, "joint_51"), (55, "joint_54")])
-def test_the_joints_that_the_family_shares_have_its_names(joints: int, last: str, tmp_path: Path) -> None:
-    write_npz(tmp_path / "body.npz", **smpl_fields(joints=joints))
-    names = read_smpl(tmp_path / "body.npz").joint_names
-    assert names[:22] == tuple(SMPL_TREE)
-    assert names[-1] == last
-    assert len(set(names)) == joints
-
-
-def test_what_is_no_array_of_numbers_is_passed_over(tmp_path: Path) -> None:
-    np.savez(tmp_path / "body.npz", **smpl_fields(), note="by hand", part2num=np.array({"pelvis": 0}, object))
-    assert len(read_smpl(tmp_path / "body.npz").joints) == 24
-    fields = smpl_fields()
-    fields["weights"] = fields["weights"].astype(object)
-    np.savez(tmp_path / "body.npz", **fields)
-    with pytest.raises(InputError, match="found no weights"):
-        read_smpl(tmp_path / "body.npz")
-
-
 @pytest.mark.parametrize("name", ["shape_directions", "joints", "joint_directions", "skin_weights"])
 def test_a_body_is_of_finite_numbers(name: str) -> None:
     body = make_body()
@@ -168,11 +91,3 @@ def test_a_body_is_of_finite_numbers(name: str) -> None:
     broken[(0,) * broken.ndim] = np.nan
     with pytest.raises(InputError, match=rf"Body\.{name}: expected finite numbers"):
         replace(body, **{name: broken})
-
-
-def test_missing_parts_are_named(tmp_path: Path) -> None:
-    fields = smpl_fields()
-    del fields["weights"]
-    write_npz(tmp_path / "body.npz", **fields)
-    with pytest.raises(InputError, match=r"body\.npz: expected an SMPL-family body, found no weights"):
-        read_smpl(tmp_path / "body.npz")

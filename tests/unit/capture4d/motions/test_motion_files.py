@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import re
+import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,33 +13,15 @@ from scipy.spatial.transform import Rotation
 
 from capture4d.body.anny import load_anny
 from capture4d.body.skinning import pose_frame, with_shape
-from capture4d.body.smpl import SMPL_JOINTS
 from capture4d.errors import InputError
-from capture4d.motions.bvh import Bvh, format_bvh, read_bvh
+from capture4d.files.records import save_poses
+from capture4d.motions.bvh import Bvh, format_bvh, moved_by_root
+from capture4d.motions.clips import understood
 from capture4d.motions.motion_files import read_motion, resample, write_motion
-from capture4d.motions.retargeting import SMPL_TREE, retarget
-from capture4d.types import Body, Mesh, PoseSequence
-
-
-@pytest.fixture(scope="module")
-def smpl_like() -> Body:
-    """SMPL's 24 joints on a generated cloud of faces."""
-    parents = [*(parent for parent, _ in SMPL_TREE.values()), 20, 21]
-    offsets = [*(offset for _, offset in SMPL_TREE.values()), (0.08, 0, 0), (-0.08, 0, 0)]
-    joints = np.zeros((24, 3))
-    for joint, (parent, offset) in enumerate(zip(parents, offsets, strict=True)):
-        joints[joint] = np.array(offset) + (joints[parent] if parent >= 0 else 0)
-    rng = np.random.default_rng(0)
-    vertices = np.repeat(joints, 3, axis=0) + 0.03 * rng.standard_normal((72, 3))
-    return Body(
-        template=Mesh(vertices.astype(np.float32), np.arange(72, dtype=np.int32).reshape(-1, 3)),
-        shape_directions=(0.01 * rng.standard_normal((10, 72, 3))).astype(np.float32),
-        joints=joints.astype(np.float32),
-        joint_directions=(0.01 * rng.standard_normal((10, 24, 3))).astype(np.float32),
-        joint_names=tuple(SMPL_JOINTS),
-        parents=np.array(parents, np.int32),
-        skin_weights=np.repeat(np.eye(24, dtype=np.float32), 3, axis=0),
-    )
+from capture4d.motions.retargeting import retarget
+from capture4d.types import Body, PoseSequence
+from tests.bvh_files import TOOLS, text, walk
+from tests.command_line import fails, run
 
 
 def random_poses(body: Body, seed: int, frames: int = 5) -> PoseSequence:
@@ -126,7 +108,7 @@ def cmu_clip(spine: tuple[str, ...], arm: tuple[str, ...], leg: tuple[str, ...],
     places = np.array([0.0, 95.0, 0.0]) + np.outer(at, rng.normal(0, 20, 3) * (1, 0, 1))
     return Bvh(
         Path("generated.bvh"), tuple(names), np.array(parents), np.array(offsets, float),
-        Rotation.from_rotvec(vectors.reshape(-1, 3)), places, 1 / 120,
+        Rotation.from_rotvec(vectors.reshape(-1, 3)), moved_by_root(np.array(offsets, float), places), 1 / 120,
     )  # fmt: skip
 
 
@@ -172,7 +154,7 @@ def test_hands_of_a_t_pose_continue_the_arms() -> None:
     source = cmu_clip(*NAMINGS[0], seed=0)
     still = replace(source, rotations=Rotation.identity(40 * len(source.parents)))
     body = load_anny()
-    poses = retarget(with_shape(body, np.zeros(0, np.float32)), still, 60.0)
+    poses = retarget(with_shape(body, np.zeros(0, np.float32)), understood(still)[0], 60.0)
     wrist = poses.rotations[0, body.joint_names.index("wrist.L")]
     assert np.degrees(Rotation.from_matrix(wrist).magnitude()) < 1.0
 
@@ -217,6 +199,13 @@ def test_resampling_at_the_same_rate_changes_nothing() -> None:
     np.testing.assert_allclose(doubled.rotations[::2], poses.rotations, atol=1e-6)
 
 
+@pytest.mark.parametrize(("own", "fps"), [(60.0, 1e12), (1e-200, 60.0), (60.0, np.inf)])
+def test_a_rate_that_is_none_asks_for_no_memory(own: float, fps: float, tmp_path: Path) -> None:
+    save_poses(tmp_path / "poses.npz", replace(random_poses(load_anny(), 6), fps=own))
+    with pytest.raises(InputError, match=r"poses\.npz: expected at most 100000 frames"):
+        read_motion(tmp_path / "poses.npz", load_anny(), fps=fps)
+
+
 def test_what_is_no_motion_is_named(tmp_path: Path) -> None:
     body = load_anny()
     with pytest.raises(InputError, match="no such motion file"):
@@ -225,10 +214,12 @@ def test_what_is_no_motion_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"expected a motion file \.npz or \.bvh"):
         read_motion(tmp_path / "notes.txt", body)
     np.savez(tmp_path / "clip.npz", poses=np.zeros((2, 66)), trans=np.zeros((2, 3)))
-    with pytest.raises(InputError, match="expected a frame rate as mocap_framerate or mocap_frame_rate"):
+    with pytest.raises(
+        InputError, match="expected a frame rate as mocap_framerate or mocap_frame_rate or fps, found none"
+    ):
         read_motion(tmp_path / "clip.npz", body)
     np.savez(tmp_path / "clip.npz", poses=np.zeros((2, 30)), trans=np.zeros((2, 3)))
-    with pytest.raises(InputError, match=r"expected poses \(T, 66 or more\)"):
+    with pytest.raises(InputError, match="'poses': expected rotation vectors or matrices of 22 or more joints"):
         read_motion(tmp_path / "clip.npz", body)
     write_motion(tmp_path / "own.npz", body, replace(random_poses(body, 7), joint_names=tuple("j" * 36)))
     with pytest.raises(InputError, match="expected the body's 36 joints"):
@@ -241,48 +232,90 @@ def test_a_body_without_the_joints_that_a_motion_drives_is_named() -> None:
         names = tuple(name.replace(missing, "other") for name in body.joint_names)
         shaped = with_shape(replace(body, joint_names=names), np.zeros(0, np.float32))
         with pytest.raises(InputError, match=f"found none called {missing}"):
-            retarget(shaped, source, 60.0)
-
-
-BVH = """HIERARCHY
-ROOT hips
-{
-  OFFSET 0 0 0
-  CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
-  End Site
-  {
-    OFFSET 0 1 0
-  }
-}
-MOTION
-Frames: 1
-Frame Time: 0.01
-0 0 0 0 0 0
-"""
-
-
-def test_what_is_no_bvh_is_named_by_its_line(tmp_path: Path) -> None:
-    path = tmp_path / "clip.bvh"
-    path.write_text(BVH)
-    assert read_bvh(path).joint_names == ("hips",)
-    for before, after, said in (
-        ("Frames: 1", "Frames: 0", "line 12: expected at least one frame, found 0"),
-        ("Frames: 1", "Frames: -2", "line 12: expected at least one frame, found -2"),
-        ("Frames: 1", "Frames: 2", "line 15: not a BVH file, or cut short"),
-        ("Time: 0.01", "Time: 0", "line 13: expected a positive frame time, found 0"),
-        ("Time: 0.01", "Time: nan", "line 13: expected a positive frame time, found nan"),
-        ("ROOT hips\n{", "{\nROOT hips", "line 2: not a BVH file"),
-        (BVH[: BVH.index("MOTION")], "HIERARCHY\n", "expected a joint tree"),
-        ("Zrotation Xrotation", "Wrotation Xrotation", "line 5: not a BVH file"),
-        ("0 0 0 0 0 0", "0 0 0 0 nan 0", "expected finite channel values"),
-        ("0 0 0 0 0 0", "0 0 0", "line 14: expected 6 channel values, found 3"),
-    ):
-        path.write_text(BVH.replace(before, after))
-        with pytest.raises(InputError, match=re.escape(said)):
-            read_bvh(path)
+            retarget(shaped, understood(source)[0], 60.0)
 
 
 def test_poses_have_a_shape_of_finite_numbers() -> None:
     poses = random_poses(load_anny(), 0)
     with pytest.raises(InputError, match=r"PoseSequence\.shape: expected finite numbers"):
         replace(poses, shape=np.array([np.nan], np.float32))
+
+
+def test_rotations_that_are_none_are_named(tmp_path: Path) -> None:
+    body = load_anny()
+    poses = random_poses(body, 2)
+    for wrong in (np.zeros((3, 3)), np.diag([1, 1, -1]), 2 * np.eye(3)):
+        rotations = poses.rotations.copy()
+        rotations[3, 6] = wrong
+        save_poses(tmp_path / "poses.npz", replace(poses, rotations=rotations))
+        with pytest.raises(
+            InputError, match=r"poses\.npz: expected rotations, found a matrix that is none in frame 3, foot"
+        ):
+            read_motion(tmp_path / "poses.npz", body)
+
+
+# --- through the command
+
+
+@pytest.fixture
+def strange(tmp_path: Path) -> Path:
+    """Z up, and joints that nobody would know."""
+    axes = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    base = walk()
+    (tmp_path / "in.bvh").write_text(text(base.called(lambda part: f"q{base.names.index(part)}").in_axes(axes)))
+    given = {part: f"q{base.names.index(part)}" for part in base.names if part not in ("neck1", "neck2", "spine1")}
+    ours = {
+        "spine2": "spine03",
+        "spine3": "spine01",
+        "left_hip": "upperleg01.L",
+        "right_ankle": "foot.R",
+        "pelvis": "root",
+    }
+    given = {ours.get(part, part): name for part, name in given.items()} | {"spine05": f"q{base.names.index('spine1')}"}
+    (tmp_path / "names.json").write_text(json.dumps(given))
+    return tmp_path
+
+
+def test_joints_and_axes_may_be_told(strange: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = strange / "out.npz"
+    assert "--names takes a JSON file" in fails(capsys, "convert-poses", strange / "in.bvh", out)
+    how = ("--names", strange / "names.json", "--up", "z", "--facing", "-y")
+    assert run("convert-poses", strange / "in.bvh", out, *how) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert "Z up, -Y forward; in centimetres" in said[0]
+    assert said[1] == f"6 poses at 30 fps: {out}"
+    (strange / "plain.bvh").write_text(text(walk().called(TOOLS["cmu"])))
+    body = load_anny()
+    found, expected = (centres(body, read_motion(strange / name, body)) for name in ("out.npz", "plain.bvh"))
+    np.testing.assert_allclose(found, expected, atol=1e-3)
+
+
+@pytest.mark.parametrize(("names", "said"), [
+    ("mixxamo", "--names: expected auto, mixamo, cmu,"),
+    ("none.json", "none.json: no such file"),
+    ({"tail": "q1"}, "names.json: expected joints of SMPL or of the built-in body, found 'tail'"),
+    ({"head": 3}, "names.json: expected the name of a joint for 'head'"),
+    ({"head": "q99"}, "in.bvh: expected one joint called 'q99' for head, found none"),
+    (["head"], "names.json: expected a JSON object, our joint: their joint, found list"),
+])  # fmt: skip
+def test_wrong_names_are_one_line(names, said: str, strange: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    if not isinstance(names, str):
+        (strange / "names.json").write_text(json.dumps(names))
+        names = strange / "names.json"
+    assert said in fails(capsys, "convert-poses", strange / "in.bvh", strange / "out.npz", "--names", names)
+    assert not (strange / "out.npz").exists()
+
+
+def test_axes_are_not_told_of_poses_of_ours(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    save_poses(tmp_path / "poses.npz", random_poses(load_anny(), 1))
+    said = fails(capsys, "convert-poses", tmp_path / "poses.npz", tmp_path / "out.npz", "--up", "z")
+    assert "expected neither --up nor --facing" in said
+
+
+def test_what_looks_mirrored_is_told(tmp_path: Path) -> None:
+    base = walk().called(TOOLS["cmu"])
+    flip = np.diag([-1.0, 1, 1])
+    (tmp_path / "in.bvh").write_text(text(base.in_axes(flip)))
+    notes: list[str] = []
+    read_motion(tmp_path / "in.bvh", load_anny(), say=notes.append)
+    assert "the file mirrored" in notes[-1]
