@@ -20,6 +20,7 @@ from capture4d.calibration.adjustment import RigEstimate, view_residuals
 from capture4d.cameras.board import BoardView
 from capture4d.cameras.projection import (
     LENS_PARAMETERS,
+    camera_lens,
     cross_matrix,
     lens_jacobian,
     point_jacobian,
@@ -60,14 +61,14 @@ class ViewSystem:
 def linearise(estimate: RigEstimate, view: BoardView) -> ViewSystem:
     """Residuals of a view and their derivatives."""
     rig = estimate.rig
-    K, D = rig.intrinsics[view.camera], rig.distortion[view.camera]
+    lens = camera_lens(rig, view.camera)
     T_camera_board = rig.T_camera_world[view.camera] @ estimate.T_world_board[view.pose]
     points = estimate.corners[view.ids]
     local = transform(T_camera_board, points)
-    by_point = point_jacobian(local, K, D)
-    by_camera = np.concatenate([lens_jacobian(local, K, D), by_point @ twist_jacobian(local)], axis=2)
+    by_point = point_jacobian(local, lens)
+    by_camera = np.concatenate([lens_jacobian(local, lens), by_point @ twist_jacobian(local)], axis=2)
     by_board = by_point @ (T_camera_board[:3, :3] @ twist_jacobian(points))
-    return ViewSystem(view, project(local, K, D) - view.pixels, by_camera, by_board)
+    return ViewSystem(view, project(local, lens) - view.pixels, by_camera, by_board)
 
 
 def robust_scale(residuals: Float64[np.ndarray, "corners 2"]) -> float:

@@ -16,7 +16,7 @@ from jaxtyping import Float64, UInt8
 from numba import njit
 
 from capture4d.cameras.board import Board
-from capture4d.cameras.projection import project, transform, undistort
+from capture4d.cameras.projection import camera_lens, project, transform, undistort
 from capture4d.settings import NonNegative, Range, Whole, settings
 from capture4d.types import Rig
 
@@ -71,7 +71,7 @@ def photograph_board(
     hands = _on_the_rim(size, config.hands, rng)
     local = transform(T_camera_board, _rim(size, config.margin_m))
     if local[:, 2].min() > NEAREST_M:
-        pixels = project(local, rig.intrinsics[camera], rig.distortion[camera])
+        pixels = project(local, camera_lens(rig, camera))
         low = np.clip(np.floor(pixels.min(axis=0)).astype(int) - 2, 0, (width, height))
         high = np.clip(np.ceil(pixels.max(axis=0)).astype(int) + 3, 0, (width, height))
         if (high > low).all():
@@ -110,7 +110,7 @@ def _inverse_lens(rig: Rig, camera: int, low: np.ndarray, high: np.ndarray) -> F
     columns, rows = (np.arange(0, length + 2 * LENS_STEP, LENS_STEP) - 0.5 for length in high - low)
     u, v = np.meshgrid(columns + low[0], rows + low[1])
     pixels = np.stack([u.ravel(), v.ravel()], axis=1)
-    return undistort(pixels, rig.intrinsics[camera], rig.distortion[camera]).reshape(*u.shape, 2)
+    return undistort(pixels, camera_lens(rig, camera)).reshape(*u.shape, 2)
 
 
 def _pattern(

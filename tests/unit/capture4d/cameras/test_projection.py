@@ -8,6 +8,7 @@ import pytest
 
 from benchmarks.simulated_views import calibration_rig
 from capture4d.cameras.projection import (
+    Lens,
     lens_jacobian,
     point_jacobian,
     project,
@@ -22,6 +23,7 @@ from capture4d.cameras.projection import (
 
 K = np.array([[1400.0, 0, 700.3], [0, 1410.0, 512.8], [0, 0, 1]])
 D = np.array([-0.12, 0.09, 4e-4, -6e-4, 0.01])
+LENS = Lens(K, D)
 
 
 @pytest.fixture(params=[0, 1])
@@ -32,7 +34,7 @@ def points(request: pytest.FixtureRequest) -> np.ndarray:
 
 def test_it_is_opencvs_model(points: np.ndarray):
     expected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, D)[0].reshape(-1, 2)
-    np.testing.assert_allclose(project(points, K, D), expected, atol=1e-9)
+    np.testing.assert_allclose(project(points, LENS), expected, atol=1e-9)
 
 
 def test_derivatives_are_those_of_finite_differences(points: np.ndarray):
@@ -43,8 +45,8 @@ def test_derivatives_are_those_of_finite_differences(points: np.ndarray):
 
     for axis in range(3):
         shift = np.eye(3)[axis]
-        numeric = central(lambda h, shift=shift: project(points + h * shift, K, D))
-        np.testing.assert_allclose(point_jacobian(points, K, D)[:, :, axis], numeric, rtol=1e-6, atol=1e-5)
+        numeric = central(lambda h, shift=shift: project(points + h * shift, LENS))
+        np.testing.assert_allclose(point_jacobian(points, LENS)[:, :, axis], numeric, rtol=1e-6, atol=1e-5)
         turned = central(lambda h, shift=shift: points @ rotation_from_vector(h * shift).T)
         np.testing.assert_allclose(twist_jacobian(points)[:, :, axis], turned, atol=1e-8)
     np.testing.assert_array_equal(twist_jacobian(points)[:, :, 3:], np.tile(np.eye(3), (len(points), 1, 1)))
@@ -55,13 +57,13 @@ def test_derivatives_are_those_of_finite_differences(points: np.ndarray):
             lens[places[index]] = 1
         else:
             bent[index - 4] = 1
-        numeric = central(lambda h, lens=lens, bent=bent: project(points, K + h * lens, D + h * bent))
-        np.testing.assert_allclose(lens_jacobian(points, K, D)[:, :, index], numeric, rtol=1e-6, atol=1e-5)
+        numeric = central(lambda h, lens=lens, bent=bent: project(points, Lens(K + h * lens, D + h * bent)))
+        np.testing.assert_allclose(lens_jacobian(points, LENS)[:, :, index], numeric, rtol=1e-6, atol=1e-5)
 
 
 def test_undistort_is_the_inverse(points: np.ndarray):
     expected = points[:, :2] / points[:, 2:]
-    np.testing.assert_allclose(undistort(project(points, K, D), K, D), expected, atol=1e-12)
+    np.testing.assert_allclose(undistort(project(points, LENS), LENS), expected, atol=1e-12)
 
 
 def test_what_several_cameras_see_is_triangulated_exactly():
