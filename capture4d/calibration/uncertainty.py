@@ -39,7 +39,9 @@ __all__ = [
     "fit_board",
     "linearise",
     "noise_of",
+    "robust_cost",
     "robust_scale",
+    "twisted",
 ]
 
 CAMERA_UNKNOWNS = len(LENS_PARAMETERS) + 6
@@ -133,7 +135,7 @@ def fit_board(
     """
     (pose,) = {view.pose for view in views}
     systems = [linearise(estimate, view) for view in views]
-    cost, damping = _cost(systems, loss_px), 1e-6
+    cost, damping = robust_cost(systems, loss_px), 1e-6
     for _ in range(FIT_STEPS):
         r = np.concatenate([system.residuals.reshape(-1) for system in systems])
         J = np.concatenate([system.by_board.reshape(-1, 6) for system in systems])
@@ -141,10 +143,10 @@ def fit_board(
         normal = J.T @ (w[:, None] * J)
         step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), J.T @ (w * r))
         moved = estimate.T_world_board.copy()
-        moved[pose] = moved[pose] @ _twisted(step)
+        moved[pose] = moved[pose] @ twisted(step)
         trial = replace(estimate, T_world_board=moved)
         trial_systems = [linearise(trial, view) for view in views]
-        trial_cost = _cost(trial_systems, loss_px)
+        trial_cost = robust_cost(trial_systems, loss_px)
         if trial_cost > cost:
             damping = max(10 * damping, 1e-4)
             if damping > 1e6:
@@ -157,14 +159,16 @@ def fit_board(
     return estimate.T_world_board[pose], systems
 
 
-def _twisted(twist: Float64[np.ndarray, " 6"]) -> Float64[np.ndarray, "4 4"]:
+def twisted(twist: Float64[np.ndarray, " 6"]) -> Float64[np.ndarray, "4 4"]:
+    """The movement (w, t), whole."""
     matrix = np.eye(4)
     matrix[:3, :3] = rotation_from_vector(twist[:3])
     matrix[:3, 3] = twist[3:]
     return matrix
 
 
-def _cost(systems: Sequence[ViewSystem], loss_px: float) -> float:
+def robust_cost(systems: Sequence[ViewSystem], loss_px: float) -> float:
+    """Cauchy's loss of all residuals."""
     return sum(float(np.log1p((system.residuals**2).sum(axis=1) / loss_px**2).sum()) for system in systems)
 
 
