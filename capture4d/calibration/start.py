@@ -29,7 +29,7 @@ __all__ = ["LEAST_VIEWS", "require_connected", "start_rig", "usable_views"]
 
 FISHEYE_FOCALS = np.geomspace(0.15, 2.0, 24)
 """Tried as the focal length of a fisheye, in parts of the longer side of its image."""
-FISHEYE_LOSSES_PX, FISHEYE_STEPS = (100.0, 10.0, 2.0), 30
+FISHEYE_LOSSES_PX, FISHEYE_STEPS = (100.0, 10.0, 2.0), 12
 LEAST_VIEWS = 3
 """Of one camera: Zhang's method needs two, and the noise one more."""
 
@@ -204,7 +204,7 @@ def _refine_lens(estimate: RigEstimate, views: Sequence[BoardView], loss_px: flo
             continue
         gained, cost = cost - trial_cost, trial_cost
         estimate, systems, damping = trial, trial_systems, damping / 10
-        if gained <= 1e-9 * cost:
+        if gained <= 1e-3 * cost:
             break
     return estimate
 
