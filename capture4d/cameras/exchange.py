@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from capture4d.cameras.colmap import read_model, write_model
+from capture4d.cameras.colmap_files import model_suffix
 from capture4d.cameras.metashape import read_metashape
 from capture4d.cameras.nerfstudio import read_transforms
 from capture4d.errors import InputError
@@ -56,7 +57,8 @@ def read_foreign_rig(source: Path) -> ForeignRig:
     """
     if source.is_dir():
         transforms = source / _TRANSFORMS
-        return ForeignRig(read_transforms(transforms) if transforms.is_file() else read_model(source))
+        made_for_nerf = model_suffix(source) is None and transforms.is_file()
+        return ForeignRig(read_transforms(transforms) if made_for_nerf else read_model(source))
     if source.suffix.lower() in (".bin", ".txt") and source.stem in ("cameras", "images", "points3D", "frames", "rigs"):
         return ForeignRig(read_model(source.parent))
     if _begins_with(source) == "<":

@@ -297,6 +297,32 @@ def test_where_a_model_lies_twice_the_binary_one_counts(rig: Rig, tmp_path: Path
     assert {f"{name}.png" for name in read_model(tmp_path).names} == theirs
 
 
+def test_pycolmaps_reader_is_never_asked(rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """It spins, or ends the process, on files that lie."""
+    write_model(tmp_path, rig)
+
+    def never() -> None:
+        raise AssertionError("read by pycolmap")
+
+    monkeypatch.setattr("capture4d.cameras.colmap.import_pycolmap", never)
+    assert read_model(tmp_path).names == rig.names
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("cut", [0.0, 0.1, 0.4, 0.7, 0.95])
+def test_files_that_are_cut_off_are_read_or_named(rig: Rig, tmp_path: Path, text: bool, cut: float):
+    write_model(tmp_path, rig, text=text)
+    for path in sorted(tmp_path.iterdir()):
+        whole = path.read_bytes()
+        path.write_bytes(whole[: int(cut * len(whole))])
+        try:
+            assert len(read_model(tmp_path).names) <= len(rig.names)
+        except InputError as error:
+            assert "\n" not in str(error)
+            assert error.where is not None
+        path.write_bytes(whole)
+
+
 def fisheye_rig() -> Rig:
     rig = calibration_rig(3, rng=np.random.default_rng(7), focal_px=700.0)
     bent = np.array([[0.02, -0.01, 4e-3, -1e-3, 0], [-0.11, 0.09, 1e-3, -2e-3, 0], [0.05, 0.01, 0, 0, 0]])
