@@ -9,6 +9,7 @@ Validation lives in `__post_init__` and nowhere else: what a type holds can be r
 from __future__ import annotations
 
 import unicodedata
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
@@ -116,10 +117,11 @@ class Rig:
             object.__setattr__(self, "lenses", ("brown",) * count)
         if len(self.lenses) != count:
             raise InputError(f"Rig.lenses: expected a lens for each of {count} cameras, found {len(self.lenses)}")
+        twice = [name for name, times in Counter(self.names).items() if times > 1]
         for camera in range(count):
-            self._require_camera(camera)
+            self._require_camera(camera, twice[:1])
 
-    def _require_camera(self, camera: int) -> None:
+    def _require_camera(self, camera: int, twice: list[str]) -> None:
         """Raise unless its numbers can be those of a camera."""
         name, K, T = self.names[camera], self.intrinsics[camera], self.T_camera_world[camera]
         width, height = self.image_sizes[camera].tolist()
@@ -127,7 +129,7 @@ class Rig:
         fault = None
         if name in ("", ".", "..") or any(c in "/\\" or unicodedata.category(c) in ("Cc", "Cs") for c in name):
             fault = "a name without separators and control characters", f"{name!r}"
-        elif name in self.names[:camera]:
+        elif name in twice:
             fault = "a name of its own", "it twice"
         elif width <= 0 or height <= 0:
             fault = "the size of an image", f"{width} x {height}"

@@ -56,7 +56,7 @@ MODELS = (
 _CAMERA_SENSOR = 0
 _DEEPEST = 3
 """Folders below one that is given in which a model is looked for: PROJECT/dense/sparse/0."""
-_MOST_FOLDERS = 2000
+_MOST_FOLDERS = 20_000
 _KIND = "COLMAP model"
 _Row = TypeVar("_Row")
 

