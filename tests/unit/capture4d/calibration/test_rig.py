@@ -161,6 +161,23 @@ def test_the_report_tells_what_to_film_next():
     assert np.array_equal(np.diag(report["shared_poses"]), [row["poses"] for row in report["cameras"]])
 
 
+def test_the_scale_of_a_pose_does_not_depend_on_how_the_board_is_held():
+    """Of few corners, far from symmetric, the median of each coordinate moves with the axes."""
+    rig, _, views = scene(0, 0.01)
+    few = [replace(view, ids=view.ids[view.ids < 20], pixels=view.pixels[view.ids < 20]) for view in views]
+    few = [view for view in few if BOARD.is_fixed_by(view.ids)]
+    calibration = calibrated(rig, views)
+    report = calibration_report(
+        replace(calibration, views=few),
+        BOARD,
+        pose_names=[f"{pose:03d}" for pose in range(POSES)],
+        config=CalibrationConfig(hold_out=0, flatness=False),
+    )
+    scales = [row["scale_ppm"] for row in report["volume"] if row["scale_ppm"] is not None]
+    assert len(scales) > 4
+    assert np.abs(scales).max() < 500
+
+
 def test_the_scale_is_the_boards():
     """A board printed 1 % too small makes a rig 1 % too large; nothing in the images tells."""
     rig, _, views = scene(0, 0.03)
