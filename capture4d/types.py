@@ -8,9 +8,11 @@ Validation lives in `__post_init__` and nowhere else: what a type holds can be r
 
 from __future__ import annotations
 
+import unicodedata
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 from jaxtyping import Float32, Int32, UInt8
@@ -22,6 +24,7 @@ __all__ = [
     "Body",
     "Garment",
     "GarmentScan",
+    "LensModel",
     "Mesh",
     "PoseSequence",
     "RegisteredSequence",
@@ -79,19 +82,28 @@ class Mesh:
         return Mesh(vertices, self.faces, self.uv)
 
 
+LensModel = Literal["brown", "fisheye"]
+"""OpenCV's pinhole camera with radial and tangential distortion, and its equidistant fisheye."""
+ROTATION_TOLERANCE = 1e-4
+"""How far rounding in a file may take a rotation from one."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Rig:
     """Calibrated cameras. Camera axes are OpenCV's: x right, y down, z forward; pixel centres lie at integers."""
 
     names: tuple[str, ...]
+    """Different from each other, and fit to be names of files and folders."""
     intrinsics: np.ndarray
     """(C, 3, 3) float64, pixels."""
     distortion: np.ndarray
-    """(C, 5) float64, OpenCV order k1 k2 p1 p2 k3."""
+    """(C, 5) float64, OpenCV order k1 k2 p1 p2 k3; of a fisheye k1 k2 k3 k4 and 0."""
     T_camera_world: np.ndarray
     """(C, 4, 4) float64: a world point, metres, in the camera's axes."""
     image_sizes: np.ndarray
     """(C, 2) int32: width, height."""
+    lenses: tuple[LensModel, ...] = ()
+    """Of each camera; all `brown` if left out."""
 
     def __post_init__(self) -> None:
         count = len(self.names)
@@ -101,6 +113,43 @@ class Rig:
         _require_array("Rig", "image_sizes", self.image_sizes, (count, 2), np.int32)
         for name in ("intrinsics", "distortion", "T_camera_world"):
             _require_finite("Rig", name, getattr(self, name))
+        if not self.lenses:
+            object.__setattr__(self, "lenses", ("brown",) * count)
+        if len(self.lenses) != count:
+            raise InputError(f"Rig.lenses: expected a lens for each of {count} cameras, found {len(self.lenses)}")
+        twice = [name for name, times in Counter(self.names).items() if times > 1]
+        for camera in range(count):
+            self._require_camera(camera, twice[:1])
+
+    def _require_camera(self, camera: int, twice: list[str]) -> None:
+        """Raise unless its numbers can be those of a camera."""
+        name, K, T = self.names[camera], self.intrinsics[camera], self.T_camera_world[camera]
+        width, height = self.image_sizes[camera].tolist()
+        lens, turn = self.lenses[camera], T[:3, :3]
+        fault = None
+        if name in ("", ".", "..") or any(c in "/\\" or unicodedata.category(c) in ("Cc", "Cs") for c in name):
+            fault = "a name without separators and control characters", f"{name!r}"
+        elif name in twice:
+            fault = "a name of its own", "it twice"
+        elif width <= 0 or height <= 0:
+            fault = "the size of an image", f"{width} x {height}"
+        elif not (K[0, 0] > 0 and K[1, 1] > 0):
+            fault = "positive focal lengths in its intrinsics", f"{K[0, 0]:g} and {K[1, 1]:g}"
+        elif K[2].tolist() != [0, 0, 1]:
+            fault = "intrinsics with a last row of 0 0 1", " ".join(f"{value:g}" for value in K[2])
+        elif lens not in get_args(LensModel):
+            fault = f"a lens of {', '.join(get_args(LensModel))}", f"{lens!r}"
+        elif lens == "fisheye" and self.distortion[camera, 4] != 0:
+            fault = "four coefficients of a fisheye", f"a fifth of {self.distortion[camera, 4]:g}"
+        elif np.abs(T[3] - (0, 0, 0, 1)).max() > ROTATION_TOLERANCE:
+            fault = "a T_camera_world with a last row of 0 0 0 1", " ".join(f"{value:g}" for value in T[3])
+        elif not np.abs(turn @ turn.T - np.eye(3)).max() < ROTATION_TOLERANCE:
+            lengths = ", ".join(f"{length:g}" for length in np.linalg.norm(turn, axis=1))
+            fault = "a rotation in T_camera_world", f"rows that are not orthonormal, of lengths {lengths}"
+        elif np.linalg.det(turn) < 0:
+            fault = "a rotation in T_camera_world", "a mirror image"
+        if fault is not None:
+            raise InputError(f"Rig: camera {ascii(name)[:80]}: expected {fault[0]}, found {fault[1][:120]}")
 
     @property
     def centres(self) -> np.ndarray:

@@ -16,7 +16,7 @@ from jaxtyping import Float64
 
 from capture4d.cameras.board import BoardView
 from capture4d.cameras.colmap import colmap_camera, lens_of, sensor, to_colmap_pixels
-from capture4d.cameras.projection import project, transform
+from capture4d.cameras.projection import camera_lens, project, transform
 from capture4d.errors import InputError
 from capture4d.heavy_imports import import_pycolmap
 from capture4d.types import Rig
@@ -85,7 +85,7 @@ def view_residuals(estimate: RigEstimate, view: BoardView) -> Float64[np.ndarray
     rig = estimate.rig
     T_camera_board = rig.T_camera_world[view.camera] @ estimate.T_world_board[view.pose]
     local = transform(T_camera_board, estimate.corners[view.ids])
-    return project(local, rig.intrinsics[view.camera], rig.distortion[view.camera]) - view.pixels
+    return project(local, camera_lens(rig, view.camera)) - view.pixels
 
 
 def _reconstruction(start: RigEstimate, views: Sequence[BoardView], reference: int) -> Any:
@@ -97,8 +97,7 @@ def _reconstruction(start: RigEstimate, views: Sequence[BoardView], reference: i
     colmap_rig = pycolmap.Rig(rig_id=1)
     colmap_rig.add_ref_sensor(sensor(reference + 1))
     for camera in sorted({view.camera for view in views}):
-        lens = rig.intrinsics[camera], rig.distortion[camera], rig.image_sizes[camera]
-        model.add_camera(colmap_camera(camera + 1, *lens))
+        model.add_camera(colmap_camera(camera + 1, camera_lens(rig, camera), rig.image_sizes[camera]))
         if camera != reference:
             T_camera_reference = rig.T_camera_world[camera] @ T_world_reference
             colmap_rig.add_sensor(sensor(camera + 1), pycolmap.Rigid3d(T_camera_reference[:3]))
@@ -136,7 +135,8 @@ def _estimate(start: RigEstimate, model: Any, views: Sequence[BoardView], refere
     T_camera_world, T_world_board = rig.T_camera_world.copy(), start.T_world_board.copy()
     colmap_rig = model.rigs[1]
     for camera in {view.camera for view in views}:
-        intrinsics[camera], distortion[camera] = lens_of(model.cameras[camera + 1])
+        lens = lens_of(model.cameras[camera + 1])
+        intrinsics[camera], distortion[camera] = lens.intrinsics, lens.distortion
         if camera != reference:
             T_camera_reference = colmap_rig.sensor_from_rig(sensor(camera + 1)).matrix()
             T_camera_world[camera, :3] = T_camera_reference @ rig.T_camera_world[reference]

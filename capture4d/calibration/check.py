@@ -26,7 +26,7 @@ from capture4d.calibration.rig import LEAST_LOSS_PX
 from capture4d.calibration.start import usable_views
 from capture4d.calibration.uncertainty import CAMERA_UNKNOWNS, fit_board, linearise, noise_of, robust_scale
 from capture4d.cameras.board import Board, BoardView
-from capture4d.cameras.projection import undistort
+from capture4d.cameras.projection import camera_lens, undistort
 from capture4d.errors import InputError
 from capture4d.types import Rig
 
@@ -143,7 +143,7 @@ def _scene(rig: Rig, views: Sequence[BoardView], board: Board) -> _Scene:
 
 def _place_board(rig: Rig, view: BoardView, board: Board) -> Float64[np.ndarray, "4 4"]:
     """T_world_board from one view."""
-    flat = undistort(view.pixels, rig.intrinsics[view.camera], rig.distortion[view.camera])
+    flat = undistort(view.pixels, camera_lens(rig, view.camera))
     _, turn, shift = cv2.solvePnP(board.corners[view.ids], flat, np.eye(3), np.zeros(5), flags=cv2.SOLVEPNP_IPPE)
     T_camera_board = np.eye(4)
     T_camera_board[:3, :3], T_camera_board[:3, 3] = cv2.Rodrigues(turn)[0], np.ravel(shift)

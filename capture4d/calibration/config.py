@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from capture4d.settings import NonNegative, Part, Positive, Range, settings
 
@@ -13,6 +13,8 @@ __all__ = ["CALIBRATION", "RIG_CHECK", "CalibrationConfig", "RigCheckConfig"]
 class CalibrationConfig:
     """How a rig is calibrated."""
 
+    lens: Literal["brown", "fisheye"] = "brown"
+    """Of all cameras: a pinhole with radial and tangential distortion, or an equidistant fisheye, for wide angles."""
     floor: str | None = None
     """Pose at which the board lies on the floor, printed side up: the world's origin and its Y axis."""
     hold_out: Part = 0.15

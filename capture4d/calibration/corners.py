@@ -1,4 +1,4 @@
-"""Corners of a ChArUco board in an image: found by OpenCV, placed by fitting the printed pattern.
+"""Corners of a board in an image: found by OpenCV, placed by fitting the printed pattern.
 
 OpenCV's gradients around a corner (cornerSubPix) are pulled by markers that reach into their window, and leave most of
 the edges unused. Here each corner is the shift of a patch of the board's known pattern, as it should look through lens
@@ -7,7 +7,8 @@ IJCAI 1981). How the patch lies in the image is taken from all corners of the vi
 the lens, fitted robustly. Blur and shading are unknowns of each patch.
 
 The patch is the part of the pattern that is the same upside down: edges of squares, and the black rim of markers but
-not their bits. So a wrong guess of the blur, of how far ink has bled, or of the sensor's response does not move it.
+not their bits; a checkerboard has edges alone. So a wrong guess of the blur, of how far ink has bled, or of the
+sensor's response does not move it.
 
 Letters: q board coordinates, metres; x pixels; d the shift, s the standard deviation of the blur, pixels; P the pattern
 through lens and sensor, 0 ink and 1 paper; u, v squares from a corner. Grey levels are ink (x) + contrast (x) P, both
@@ -25,6 +26,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int32, Int64, UInt8
 from scipy.special import ndtr
 
+from capture4d.calibration.checkerboard import find_checkerboard
 from capture4d.cameras.board import Board
 
 __all__ = ["detect_corners", "find_corners"]
@@ -79,6 +81,8 @@ def find_corners(
     image: UInt8[np.ndarray, "height width"], board: Board
 ) -> tuple[Int32[np.ndarray, " found"], Float64[np.ndarray, "found 2"]]:
     """The same by OpenCV alone, a few hundredths of a pixel off."""
+    if board.plain:
+        return find_checkerboard(image, board)
     corners, ids, _, _ = _detector(board).detectBoard(image)
     if ids is None or not len(ids):
         return np.zeros(0, np.int32), np.zeros((0, 2))
@@ -207,7 +211,7 @@ def _draw_patches(
     squares = (q - board.corners[ids, None, :2]) / board.square_m
     taylor = np.linalg.pinv(_monomials(knots, 2)) @ squares
     marker = board.marker_m / board.square_m
-    gap, rim = (1 - marker) / 2, marker / board.cells_per_marker
+    gap, rim = (1 - marker) / 2, 0.0 if board.plain else marker / board.cells_per_marker
 
     u, v = np.moveaxis(_monomials(_grid(SAMPLE), 2) @ taylor, -1, 0)
     across, down = np.abs(taylor[:, SLOPES]).sum(axis=1).T[:, :, None] / SAMPLES

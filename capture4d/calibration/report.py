@@ -216,8 +216,9 @@ def _triangulated(estimate: RigEstimate, views: Sequence[BoardView]) -> dict[str
     if known.sum() < 4:
         return {"corner_median_mm": None, "corner_rms_mm": None, "scale_ppm": None, "place_m": None}
     points, made = points[known], estimate.corners[known]
-    errors = 1e3 * np.linalg.norm(transform(rigid_alignment(points, made), points) - made, axis=1)
-    spread, made_spread = (np.linalg.norm(p - np.median(p, axis=0), axis=1).sum() for p in (points, made))
+    aligned = transform(rigid_alignment(points, made), points)
+    errors = 1e3 * np.linalg.norm(aligned - made, axis=1)
+    spread, made_spread = (np.linalg.norm(p - np.median(p, axis=0), axis=1).sum() for p in (aligned, made))
     return {
         "corner_median_mm": float(np.median(errors)),
         "corner_rms_mm": float(np.sqrt((errors**2).mean())),

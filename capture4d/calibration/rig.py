@@ -32,7 +32,7 @@ class Calibration:
     views: Sequence[BoardView]
     """Those that were used."""
     covariance: Float64[np.ndarray, "cameras 14 cameras 14"]
-    """Of every camera's fx fy cx cy k1 k2 p1 p2 and the twist (radians, metres) of its axes."""
+    """Of every camera's fx fy cx cy k1 k2 p1 p2 (k3 k4 of a fisheye) and the twist (radians, metres) of its axes."""
     noise_px: float
     """Standard deviation of a coordinate of a detected corner."""
     loss_px: float
@@ -60,7 +60,7 @@ def calibrate_rig(
     """
     used = usable_views(views, board)
     require_connected(used, names)
-    start = start_rig(used, board, names=names, image_sizes=image_sizes, poses=poses)
+    start = start_rig(used, board, names=names, image_sizes=image_sizes, poses=poses, lens=config.lens)
     started = time.process_time()
     near = adjust_rig(start, used, loss_px=config.start_loss_px, iterations=15)
     loss_px = final_loss(near, used, config)

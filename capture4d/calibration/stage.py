@@ -4,52 +4,40 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
+from capture4d.calibration.board_images import PATTERN, BoardImage, find_images, natural_order, read_grey
 from capture4d.calibration.check import CameraCheck, check_rig
 from capture4d.calibration.config import CALIBRATION, RIG_CHECK, CalibrationConfig, RigCheckConfig
 from capture4d.calibration.corners import detect_corners
+from capture4d.calibration.other_boards import what_is_shown
 from capture4d.calibration.report import calibration_report
 from capture4d.calibration.rig import calibrate_rig
+from capture4d.calibration.start import usable_views
 from capture4d.calibration.uncertainty import CAMERA_UNKNOWNS
 from capture4d.cameras.board import Board, BoardView, parse_board
-from capture4d.cameras.colmap import read_model, write_model
+from capture4d.cameras.colmap import write_model
 from capture4d.errors import InputError
 from capture4d.files.arrays import ArrayFile
 from capture4d.files.atomic import read_json, write_json, write_npz
-from capture4d.files.pictures import holds_pixels
-from capture4d.files.reading import reading
 from capture4d.files.records import load_rig, save_rig
 from capture4d.runs.file_stage import open_file_stage
 from capture4d.runs.stage import StageResult
 from capture4d.runs.workers import run_jobs
 
-__all__ = ["BoardImage", "CalibrationResult", "convert", "find_images", "read_covariance", "run", "run_check"]
+__all__ = ["CalibrationResult", "read_covariance", "run", "run_check"]
 
-PATTERN = "{camera}/{pose}"
-ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
-DETECTOR = "fitted pattern"
+DETECTOR = "fitted pattern, 2"
 """Corners that an earlier detector has kept are found anew."""
 REPORT, CORNERS, COVARIANCE = "calibration.json", "calibration_corners.npz", "calibration_covariance.npz"
 RECORD = "calibration_stage.json"
 SCHEMA = 1
-
-
-@dataclass(frozen=True, slots=True)
-class BoardImage:
-    """One image of a calibration, by its names."""
-
-    camera: str
-    pose: str
-    path: Path
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -96,7 +84,7 @@ def run(
     """
     geometry = parse_board(board)
     found = find_images(images, pattern)
-    poses = sorted({image.pose for image in found}, key=_natural)
+    poses = sorted({image.pose for image in found}, key=natural_order)
     if config.floor is not None and config.floor not in poses:
         raise InputError(f"--floor: expected one of the poses {poses[0]} to {poses[-1]}, found '{config.floor}'")
     stage = open_file_stage(
@@ -127,11 +115,13 @@ def _calibrate(
     config: CalibrationConfig,
     workers: int,
 ) -> None:
-    names, poses = (sorted({getattr(image, key) for image in found}, key=_natural) for key in ("camera", "pose"))
+    names, poses = (sorted({getattr(image, key) for image in found}, key=natural_order) for key in ("camera", "pose"))
     detections = _detect_all(found, geometry, output.with_name(CORNERS), images, workers)
     sizes = _image_sizes(detections, names)
+    views = _views(detections, names, poses)
+    _require_seen(found, views, names, geometry)
     calibration = calibrate_rig(
-        _views(detections, names, poses),
+        views,
         geometry,
         names=names,
         image_sizes=sizes,
@@ -178,9 +168,9 @@ def run_check(
     strangers = sorted({image.camera for image in found} - set(rig.names))
     if strangers:
         raise InputError(f"expected cameras of {rig_path}, found {', '.join(strangers)}", where=images)
-    poses = sorted({image.pose for image in found}, key=_natural)
+    poses = sorted({image.pose for image in found}, key=natural_order)
     detections = list(run_jobs(partial(_detect, geometry), found, workers=workers, label="find the board"))
-    detections.sort(key=lambda detection: (detection.image.camera, _natural(detection.image.pose)))
+    detections.sort(key=lambda detection: (detection.image.camera, natural_order(detection.image.pose)))
     for detection in detections:
         width, height = (int(size) for size in rig.image_sizes[rig.names.index(detection.image.camera)])
         if detection.size != (width, height):
@@ -188,66 +178,18 @@ def run_check(
             raise InputError(
                 f"expected {width}x{height} pixels as in the rig, found {seen}", where=detection.image.path
             )
+    views = _views(detections, rig.names, poses)
+    if not views:
+        _require_seen(found, views, sorted({image.camera for image in found}, key=natural_order), geometry)
     covariance = read_covariance(rig_path, cameras=len(rig.names))
-    return check_rig(rig, _views(detections, rig.names, poses), geometry, covariance=covariance, config=config)
-
-
-def convert(source: Path, output: Path, *, text: bool = False) -> None:
-    """A rig.json to a COLMAP model, or a folder with a COLMAP model to a rig.json.
-
-    Raises:
-        InputError: neither, or damaged.
-    """
-    if source.is_dir():
-        save_rig(output, read_model(source))
-    else:
-        write_model(output, load_rig(source), text=text)
-
-
-def find_images(folder: Path, pattern: str = PATTERN) -> list[BoardImage]:
-    """The images of a folder, ordered by camera and pose.
-
-    Args:
-        pattern: the path of an image in the folder without its ending; {camera} and {pose} stand for the names.
-    Raises:
-        InputError: the pattern lacks one of the two, no image matches it, or two images have the same names.
-    """
-    if sorted(re.findall(r"{(.*?)}", pattern)) != ["camera", "pose"]:
-        raise InputError(f"--pattern: expected {{camera}} and {{pose}} once each, found '{pattern}'")
-    if not folder.is_dir():
-        raise InputError("no such folder", where=folder)
-    expression = re.escape(pattern.strip("/"))
-    for name in ("camera", "pose"):
-        expression = expression.replace(re.escape(f"{{{name}}}"), f"(?P<{name}>[^/]+?)")
-    paths = [path for path in sorted(folder.rglob("*")) if path.suffix.lower() in ENDINGS and path.is_file()]
-    if not paths:
-        raise InputError(f"expected images ({', '.join(ENDINGS)}), found none", where=folder)
-    found: dict[tuple[str, str], BoardImage] = {}
-    for path in paths:
-        match = re.fullmatch(expression, path.relative_to(folder).with_suffix("").as_posix())
-        if match is None:
-            continue
-        image = BoardImage(match["camera"], match["pose"], path)
-        twin = found.setdefault((image.camera, image.pose), image)
-        if twin is not image:
-            raise InputError(f"expected one image of a camera and a pose, found {twin.path} as well", where=path)
-    if not found:
-        raise InputError(f"expected images that lie as --pattern '{pattern}' says, found none", where=paths[0])
-    return sorted(found.values(), key=lambda image: (_natural(image.camera), _natural(image.pose)))
+    return check_rig(rig, views, geometry, covariance=covariance, config=config)
 
 
 # --- detections --------------------------------------------------------------------------------------------------
 
 
 def _detect(board: Board, image: BoardImage) -> _Detection:
-    with reading(image.path, "image"):
-        data = image.path.read_bytes()
-        picture = None
-        if holds_pixels(data):
-            kind = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-            picture = cv2.imdecode(np.frombuffer(data, np.uint8), kind)
-        if picture is None:
-            raise InputError("not a readable image, cut off or damaged")
+    picture = read_grey(image.path)
     ids, pixels = detect_corners(picture, board)
     return _Detection(image, (picture.shape[1], picture.shape[0]), ids, pixels)
 
@@ -265,7 +207,7 @@ def _detect_all(
             detections[detection.image] = (detection.size, detection.ids, detection.pixels)
     finally:  # an image that cannot be read must not cost those that can
         if new and detections:
-            _write_corners(cache, board, {keys[image]: found for image, found in detections.items()})
+            _write_corners(cache, board, {keys[image]: detections[image] for image in images if image in detections})
     return [_Detection(image, *detections[image]) for image in images]
 
 
@@ -325,6 +267,21 @@ def _image_sizes(detections: Sequence[_Detection], names: Sequence[str]) -> np.n
     return np.array([first[name].size for name in names], np.int32)
 
 
+def _require_seen(images: Sequence[BoardImage], views: Sequence[BoardView], names: Sequence[str], board: Board) -> None:
+    """Raise unless every camera sees the board.
+
+    Raises:
+        InputError: says which board the images show instead, if that can be told.
+    """
+    seeing = {names[view.camera] for view in usable_views(views, board)}
+    blind = [name for name in names if name not in seeing]
+    if blind:
+        says = what_is_shown([image.path for image in images if image.camera in blind], board)
+        where = "it nowhere" if not seeing else f"none of {', '.join(blind)}"
+        wanted = "in some of them" if not seeing else "in images of every camera"
+        raise InputError(f"images: expected the board {wanted}, found {where}; {says}")
+
+
 def _views(detections: Sequence[_Detection], names: Sequence[str], poses: Sequence[str]) -> list[BoardView]:
     camera_index = {name: index for index, name in enumerate(names)}
     pose_index = {name: index for index, name in enumerate(poses)}
@@ -354,8 +311,3 @@ def read_covariance(rig_path: Path, *, cameras: int) -> np.ndarray | None:
             f"expected {cameras} x {CAMERA_UNKNOWNS} unknowns squared, found {covariance.shape}", where=path
         )
     return covariance
-
-
-def _natural(name: str) -> list[tuple[int, int | str]]:
-    """Sort key that puts cam9 before cam10."""
-    return [(0, int(part)) if part.isdigit() else (1, part) for part in re.split(r"(\d+)", name) if part]

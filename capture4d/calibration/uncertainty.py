@@ -20,6 +20,7 @@ from capture4d.calibration.adjustment import RigEstimate, view_residuals
 from capture4d.cameras.board import BoardView
 from capture4d.cameras.projection import (
     LENS_PARAMETERS,
+    camera_lens,
     cross_matrix,
     lens_jacobian,
     point_jacobian,
@@ -38,7 +39,9 @@ __all__ = [
     "fit_board",
     "linearise",
     "noise_of",
+    "robust_cost",
     "robust_scale",
+    "twisted",
 ]
 
 CAMERA_UNKNOWNS = len(LENS_PARAMETERS) + 6
@@ -60,14 +63,14 @@ class ViewSystem:
 def linearise(estimate: RigEstimate, view: BoardView) -> ViewSystem:
     """Residuals of a view and their derivatives."""
     rig = estimate.rig
-    K, D = rig.intrinsics[view.camera], rig.distortion[view.camera]
+    lens = camera_lens(rig, view.camera)
     T_camera_board = rig.T_camera_world[view.camera] @ estimate.T_world_board[view.pose]
     points = estimate.corners[view.ids]
     local = transform(T_camera_board, points)
-    by_point = point_jacobian(local, K, D)
-    by_camera = np.concatenate([lens_jacobian(local, K, D), by_point @ twist_jacobian(local)], axis=2)
+    by_point = point_jacobian(local, lens)
+    by_camera = np.concatenate([lens_jacobian(local, lens), by_point @ twist_jacobian(local)], axis=2)
     by_board = by_point @ (T_camera_board[:3, :3] @ twist_jacobian(points))
-    return ViewSystem(view, project(local, K, D) - view.pixels, by_camera, by_board)
+    return ViewSystem(view, project(local, lens) - view.pixels, by_camera, by_board)
 
 
 def robust_scale(residuals: Float64[np.ndarray, "corners 2"]) -> float:
@@ -132,7 +135,7 @@ def fit_board(
     """
     (pose,) = {view.pose for view in views}
     systems = [linearise(estimate, view) for view in views]
-    cost, damping = _cost(systems, loss_px), 1e-6
+    cost, damping = robust_cost(systems, loss_px), 1e-6
     for _ in range(FIT_STEPS):
         r = np.concatenate([system.residuals.reshape(-1) for system in systems])
         J = np.concatenate([system.by_board.reshape(-1, 6) for system in systems])
@@ -140,10 +143,10 @@ def fit_board(
         normal = J.T @ (w[:, None] * J)
         step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), J.T @ (w * r))
         moved = estimate.T_world_board.copy()
-        moved[pose] = moved[pose] @ _twisted(step)
+        moved[pose] = moved[pose] @ twisted(step)
         trial = replace(estimate, T_world_board=moved)
         trial_systems = [linearise(trial, view) for view in views]
-        trial_cost = _cost(trial_systems, loss_px)
+        trial_cost = robust_cost(trial_systems, loss_px)
         if trial_cost > cost:
             damping = max(10 * damping, 1e-4)
             if damping > 1e6:
@@ -156,14 +159,16 @@ def fit_board(
     return estimate.T_world_board[pose], systems
 
 
-def _twisted(twist: Float64[np.ndarray, " 6"]) -> Float64[np.ndarray, "4 4"]:
+def twisted(twist: Float64[np.ndarray, " 6"]) -> Float64[np.ndarray, "4 4"]:
+    """The movement (w, t), whole."""
     matrix = np.eye(4)
     matrix[:3, :3] = rotation_from_vector(twist[:3])
     matrix[:3, 3] = twist[3:]
     return matrix
 
 
-def _cost(systems: Sequence[ViewSystem], loss_px: float) -> float:
+def robust_cost(systems: Sequence[ViewSystem], loss_px: float) -> float:
+    """Cauchy's loss of all residuals."""
     return sum(float(np.log1p((system.residuals**2).sum(axis=1) / loss_px**2).sum()) for system in systems)
 
 

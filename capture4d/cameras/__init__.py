@@ -1,1 +1,1 @@
-"""Cameras and the board they look at: projection, COLMAP's files."""
+"""Cameras and the board they look at: projection, and rigs in the files of other programs."""

@@ -1,5 +1,7 @@
 """COLMAP's files of cameras, images and frames, binary and text: what a rig needs of a model.
 
+Text may be written by hand: comments anywhere, and an image without the line of its points.
+
 Read here because pycolmap's reader follows the counts in a file: one that lies makes it spin, or ends the process.
 Rigs and points are not needed: an image's own pose stands in images.bin, and says the same.
 """
@@ -7,9 +9,10 @@ Rigs and points are not needed: an image's own pose stands in images.bin, and sa
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float64
@@ -18,9 +21,18 @@ from scipy.spatial.transform import Rotation
 from capture4d.errors import InputError
 from capture4d.files.reading import reading
 
-__all__ = ["ColmapCamera", "ColmapImage", "model_suffix", "read_cameras", "read_frames", "read_images"]
+__all__ = [
+    "MODELS",
+    "ColmapCamera",
+    "ColmapImage",
+    "find_model",
+    "model_suffix",
+    "read_cameras",
+    "read_frames",
+    "read_images",
+]
 
-_MODELS = (
+MODELS = (
     ("SIMPLE_PINHOLE", 3),
     ("PINHOLE", 4),
     ("SIMPLE_RADIAL", 4),
@@ -33,10 +45,20 @@ _MODELS = (
     ("RADIAL_FISHEYE", 5),
     ("THIN_PRISM_FISHEYE", 12),
     ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    ("SIMPLE_DIVISION", 4),
+    ("DIVISION", 5),
+    ("SIMPLE_FISHEYE", 3),
+    ("FISHEYE", 4),
+    ("EUCM", 6),
+    ("EQUIRECTANGULAR", 2),
 )
 """Names and numbers of parameters, by COLMAP's number of the model (sensor/models.h)."""
 _CAMERA_SENSOR = 0
+_DEEPEST = 3
+"""Folders below one that is given in which a model is looked for: PROJECT/dense/sparse/0."""
+_MOST_FOLDERS = 20_000
 _KIND = "COLMAP model"
+_Row = TypeVar("_Row")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,7 +73,7 @@ class ColmapCamera:
     def __post_init__(self) -> None:
         if not (0 < self.width < 2**31 and 0 < self.height < 2**31):
             raise InputError(f"expected the size of an image, found {self.width} x {self.height}")
-        expected = dict(_MODELS).get(self.model, len(self.parameters))
+        expected = dict(MODELS).get(self.model, len(self.parameters))
         if len(self.parameters) != expected:
             raise InputError(f"expected {expected} parameters of {self.model}, found {len(self.parameters)}")
         if not np.isfinite(self.parameters).all():
@@ -67,28 +89,54 @@ class ColmapImage:
     T_camera_world: Float64[np.ndarray, "4 4"]
 
 
-def model_suffix(folder: Path) -> str:
-    """Of the model's files.
-
-    Raises:
-        InputError: there is no model.
-    """
+def model_suffix(folder: Path) -> str | None:
+    """Of the model's files: .bin where both kinds lie there, as COLMAP does it; None if there is no model."""
     for suffix in (".bin", ".txt"):
         if all((folder / f"{part}{suffix}").is_file() for part in ("cameras", "images")):
             return suffix
-    raise InputError("expected a COLMAP model (cameras and images, .bin or .txt), found none", where=folder)
+    return None
+
+
+def find_model(folder: Path) -> Path:
+    """A folder with a model: this one, or the only one below it.
+
+    Raises:
+        InputError: there is no model, or more than one.
+    """
+    if not folder.is_dir():
+        raise InputError("no such folder", where=folder)
+    if model_suffix(folder) is not None:
+        return folder
+    level, models, looked = [folder], [], 0
+    for _ in range(_DEEPEST):
+        level = [below for above in level for below in _folders(above)][: _MOST_FOLDERS - looked]
+        looked += len(level)
+        models += [below for below in level if model_suffix(below) is not None]
+    if len(models) > 1:
+        named = ", ".join(model.relative_to(folder).as_posix() for model in models[:5])
+        raise InputError(f"expected one COLMAP model, found {len(models)} ({named}); give one of them", where=folder)
+    if not models:
+        raise InputError("expected a COLMAP model (cameras and images, .bin or .txt), found none", where=folder)
+    return models[0]
+
+
+def _folders(above: Path) -> list[Path]:
+    try:
+        return sorted(below for below in above.iterdir() if below.is_dir() and not below.is_symlink())
+    except PermissionError:
+        return []
 
 
 def read_cameras(path: Path) -> dict[int, ColmapCamera]:
     """By their numbers."""
     with reading(path, _KIND):
-        return dict(_cameras_text(path) if path.suffix == ".txt" else _cameras_binary(path))
+        return _by_number("camera", _cameras_text(path) if path.suffix == ".txt" else _cameras_binary(path))
 
 
 def read_images(path: Path) -> dict[int, ColmapImage]:
     """By their numbers."""
     with reading(path, _KIND):
-        return dict(_images_text(path) if path.suffix == ".txt" else _images_binary(path))
+        return _by_number("image", _images_text(path) if path.suffix == ".txt" else _images_binary(path))
 
 
 def read_frames(path: Path) -> dict[int, tuple[int, ...]]:
@@ -96,14 +144,24 @@ def read_frames(path: Path) -> dict[int, tuple[int, ...]]:
     if not path.is_file():
         return {}
     with reading(path, _KIND):
-        return dict(_frames_text(path) if path.suffix == ".txt" else _frames_binary(path))
+        return _by_number("frame", _frames_text(path) if path.suffix == ".txt" else _frames_binary(path))
+
+
+def _by_number(what: str, rows: Iterable[tuple[int, _Row]]) -> dict[int, _Row]:
+    found: dict[int, _Row] = {}
+    for number, row in rows:
+        if number in found:
+            raise InputError(f"expected {what}s with numbers of their own, found {what} {number} twice")
+        found[number] = row
+    return found
 
 
 def _pose(numbers: list[float] | tuple[float, ...]) -> Float64[np.ndarray, "4 4"]:
     """From a quaternion, w first, and a translation."""
-    w, x, y, z, *translation = numbers
-    if not np.isfinite(numbers).all() or w * w + x * x + y * y + z * z == 0:
+    quaternion, translation = np.array(numbers[:4]), numbers[4:]
+    if not np.isfinite(numbers).all() or not quaternion.any():
         raise InputError(f"expected a pose, found {' '.join(f'{number:g}' for number in numbers)}")
+    w, x, y, z = quaternion / np.abs(quaternion).max()  # so that its square is a number
     matrix = np.eye(4)
     matrix[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
     matrix[:3, 3] = translation
@@ -142,9 +200,9 @@ def _cameras_binary(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
     data = _Bytes(path)
     for _ in range(data.take("Q")[0]):
         number, model, width, height = data.take("IiQQ")
-        if not 0 <= model < len(_MODELS):
-            raise InputError(f"camera {number}: expected a model from 0 to {len(_MODELS) - 1}, found {model}")
-        name, count = _MODELS[model]
+        if not 0 <= model < len(MODELS):
+            raise InputError(f"camera {number}: expected a model from 0 to {len(MODELS) - 1}, found {model}")
+        name, count = MODELS[model]
         yield number, ColmapCamera(name, width, height, np.array(data.take(f"{count}d")))
 
 
@@ -169,13 +227,15 @@ def _frames_binary(path: Path) -> Iterator[tuple[int, tuple[int, ...]]]:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
-        yield number, line.strip()
+    """Without comments; names may hold what `splitlines` takes for the end of a line."""
+    for number, line in enumerate(path.read_text(encoding="utf-8-sig").split("\n"), start=1):
+        if not line.lstrip().startswith("#"):
+            yield number, line.strip()
 
 
 def _cameras_text(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
     for number, line in _lines(path):
-        if line and not line.startswith("#"):
+        if line:
             try:
                 camera_id, model, width, height, *parameters = line.split()
                 values = np.array([float(value) for value in parameters])
@@ -185,28 +245,40 @@ def _cameras_text(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
 
 
 def _images_text(path: Path) -> Iterator[tuple[int, ColmapImage]]:
-    """Two lines an image: its own, and one with its points, which may be empty."""
-    lines = _lines(path)
-    for number, line in lines:
-        if not line or line.startswith("#"):
+    """A line an image, and after it one with its points, which may be empty or missing."""
+    points_may_follow = False
+    for number, line in _lines(path):
+        if not line or (points_may_follow and _are_points(line)):
+            points_may_follow = False
             continue
         try:
             image_id, *pose, camera_id, name = line.split(maxsplit=9)
+            if len(pose) != 7:
+                raise ValueError("not ten words")
             image = ColmapImage(name, int(camera_id), _pose([float(value) for value in pose]))
+            yield int(image_id), image
         except ValueError as error:
-            raise _wrong(number, "ID QW QX QY QZ TX TY TZ CAMERA NAME", line, error) from None
-        number, points = next(lines, (number, ""))
-        try:
-            if np.array(points.split(), np.float64).size % 3:
-                raise ValueError("not three numbers a point")
-        except ValueError as error:
-            raise _wrong(number, "X Y POINT3D of every point, or an empty line", points, error) from None
-        yield int(image_id), image
+            expected = "ID QW QX QY QZ TX TY TZ CAMERA NAME"
+            if points_may_follow:
+                expected += ", or X Y POINT3D of every point of the image before"
+            raise _wrong(number, expected, line, error) from None
+        points_may_follow = True
+
+
+def _are_points(line: str) -> bool:
+    """Whether a line is numbers alone, three a point and the last of them whole."""
+    words = line.split()
+    if len(words) % 3:
+        return False
+    try:
+        return all(number.is_integer() for number in list(map(float, words))[2::3])
+    except ValueError:
+        return False
 
 
 def _frames_text(path: Path) -> Iterator[tuple[int, tuple[int, ...]]]:
     for number, line in _lines(path):
-        if line and not line.startswith("#"):
+        if line:
             words = line.split()
             try:
                 count = int(words[9])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Float64, Int32
 
+from capture4d.cameras.projection import project_world
 from capture4d.types import Rig
 
 __all__ = ["best_share", "camera_counts", "rig_middle"]
@@ -13,9 +14,12 @@ RIG_SAMPLES, RIG_STEP_M = 200, 0.3
 
 
 def camera_counts(rig: Rig, points: Float[np.ndarray, "points 3"]) -> Int32[np.ndarray, " points"]:
-    """In how many cameras' images each point lies; what hides it is not considered, nor lens distortion."""
+    """In how many cameras' images each point lies; what hides it is not considered, nor distortion but a fisheye's."""
     counts = np.zeros(len(points), np.int32)
     for camera in range(len(rig.names)):
+        if rig.lenses[camera] == "fisheye":
+            counts += project_world(rig, camera, points.astype(np.float64))[1]
+            continue
         T, (width, height) = rig.T_camera_world[camera], rig.image_sizes[camera]
         seen = points @ T[:3, :3].T + T[:3, 3]
         pixels = seen @ rig.intrinsics[camera].T

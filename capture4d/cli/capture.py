@@ -82,12 +82,13 @@ class Check:
 
 @dataclass(frozen=True, kw_only=True)
 class Calibrate:
-    """Calibrate a camera rig from images of a ChArUco board, with a report of how good it is."""
+    """Calibrate a camera rig from images of a ChArUco board or a checkerboard, with a report of how good it is."""
 
     images: Annotated[Positional[Path], arg(metavar="IMAGES")]
-    """Folder of board images: png, jpg or tif, one a camera and pose of the board."""
+    """Folder of board images: png, jpg, tif, bmp, webp, pgm or ppm, one a camera and pose of the board."""
     board: str
-    """charuco:COLUMNSxROWS:SQUARE_MM:MARKER_MM:DICTIONARY, such as charuco:14x10:60:44:DICT_5X5_100."""
+    """charuco:COLUMNSxROWS:SQUARE_MM:MARKER_MM:DICTIONARY, such as charuco:14x10:60:44:DICT_5X5_100, or
+    checkerboard:COLUMNSxROWS:SQUARE_MM; both count squares."""
     output: Path
     """rig.json to write; calibration.json and calibration.html go beside it."""
     pattern: str = "{camera}/{pose}"
@@ -126,7 +127,7 @@ class CheckRig:
     rig: Annotated[Positional[Path], arg(metavar="RIG")]
     """rig.json; the calibration.json beside it knows the board and how certain the rig is."""
     images: Annotated[Positional[Path], arg(metavar="IMAGES")]
-    """Folder of board images: png, jpg or tif; one pose will do."""
+    """Folder of board images, as for `calibrate`; one pose will do."""
     board: str | None = None
     """The board, if it is not the one of the calibration."""
     pattern: str = "{camera}/{pose}"

@@ -102,19 +102,24 @@ class ConvertBody:
 
 @dataclass(frozen=True)
 class ConvertRig:
-    """Convert a rig.json to a COLMAP model, or a COLMAP model to a rig.json."""
+    """Convert a rig.json to a COLMAP model, or a COLMAP, Metashape or nerfstudio file to a rig.json."""
 
     source: Annotated[Positional[Path], arg(metavar="SOURCE")]
-    """rig.json, or a folder with a COLMAP model, binary or text."""
+    """rig.json, a folder with a COLMAP model, a Metashape XML of cameras, or a transforms.json of nerfstudio."""
     output: Path
     """Folder for the model, or rig.json."""
     text: bool = False
     """Write the model as text."""
+    scale: Positive = 1.0
+    """Metres in a unit of the source: what others solve for has no scale of its own."""
 
     def __call__(self) -> int:
-        from capture4d.calibration.stage import convert
+        from capture4d.cameras.exchange import convert_rig
 
-        convert(self.source, self.output, text=self.text)
+        left_out = convert_rig(self.source, self.output, text=self.text, scale=self.scale)
+        if left_out:
+            more = f" and {len(left_out) - 5} more" if len(left_out) > 5 else ""
+            print(f"capture4d: {self.source}: left out {', '.join(left_out[:5])}{more}", file=sys.stderr)
         print(f"rig: {self.output}")
         return GOOD
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -103,11 +105,12 @@ def save_rig(path: str | Path, rig: Rig) -> None:
             "name": name,
             "width": int(rig.image_sizes[index, 0]),
             "height": int(rig.image_sizes[index, 1]),
+            **({} if lens == "brown" else {"lens": lens}),
             "intrinsics": rig.intrinsics[index],
-            "distortion": rig.distortion[index],
+            "distortion": rig.distortion[index, : _COEFFICIENTS[lens]],
             "T_camera_world": rig.T_camera_world[index],
         }
-        for index, name in enumerate(rig.names)
+        for index, (name, lens) in enumerate(zip(rig.names, rig.lenses, strict=True))
     ]
     write_json(path, {"format": 1, "cameras": cameras})
 
@@ -118,15 +121,62 @@ def load_rig(path: str | Path) -> Rig:
         if "cameras" not in found:
             raise InputError("expected the entry 'cameras', found none")
         cameras = found["cameras"]
+        if not isinstance(cameras, list) or not all(isinstance(camera, dict) for camera in cameras):
+            raise InputError("expected a list of objects as 'cameras', found something else")
         if not cameras:
             raise InputError("expected at least one camera, found none")
         try:
+            names = tuple(_camera_name(camera["name"]) for camera in cameras)
             return Rig(
-                names=tuple(str(camera["name"]) for camera in cameras),
-                intrinsics=np.array([camera["intrinsics"] for camera in cameras], np.float64),
-                distortion=np.array([camera["distortion"] for camera in cameras], np.float64),
-                T_camera_world=np.array([camera["T_camera_world"] for camera in cameras], np.float64),
-                image_sizes=np.array([[camera["width"], camera["height"]] for camera in cameras], np.int32),
+                names=names,
+                intrinsics=_camera_arrays(names, cameras, "intrinsics", (3, 3)),
+                distortion=np.stack([_distortion(*named) for named in zip(names, cameras, strict=True)]),
+                T_camera_world=_camera_arrays(names, cameras, "T_camera_world", (4, 4)),
+                image_sizes=np.array([_image_size(*named) for named in zip(names, cameras, strict=True)], np.int32),
+                lenses=tuple(camera.get("lens", "brown") for camera in cameras),
             )
         except KeyError as error:
             raise InputError(f"expected the entry {error} for every camera, found none") from None
+
+
+_COEFFICIENTS = {"brown": 5, "fisheye": 4}
+
+
+def _camera_name(name: Any) -> str:
+    if not isinstance(name, str | int) or isinstance(name, bool):
+        raise InputError(f"expected a text as the name of a camera, found {name!r}")
+    return str(name)
+
+
+def _camera_arrays(names: Sequence[str], cameras: Sequence[dict[str, Any]], entry: str, shape: tuple) -> np.ndarray:
+    return np.stack([_camera_array(*named, entry, shape) for named in zip(names, cameras, strict=True)])
+
+
+def _camera_array(name: str, camera: dict[str, Any], entry: str, shape: tuple[int, ...]) -> np.ndarray:
+    try:
+        values = np.array(camera[entry], np.float64)
+    except (ValueError, TypeError, OverflowError):
+        raise InputError(f"camera {name!r}: expected numbers as {entry}, found something else") from None
+    if values.shape != shape:
+        expected, seen = (" x ".join(map(str, size)) or "one" for size in (shape, values.shape))
+        raise InputError(f"camera {name!r}: expected {expected} numbers as {entry}, found {seen}")
+    return values
+
+
+def _distortion(name: str, camera: dict[str, Any]) -> np.ndarray:
+    lens = camera.get("lens", "brown")
+    count = _COEFFICIENTS.get(lens) if isinstance(lens, str) else None
+    if count is None:
+        raise InputError(f"camera {name!r}: expected a lens of {', '.join(_COEFFICIENTS)}, found {lens!r}")
+    values = _camera_array(name, camera, "distortion", (count,))
+    return np.concatenate([values, np.zeros(5 - count)])
+
+
+def _image_size(name: str, camera: dict[str, Any]) -> tuple[int, int]:
+    size = camera["width"], camera["height"]
+    for length in size:
+        if isinstance(length, bool) or not isinstance(length, int | float) or length != int(length):
+            raise InputError(f"camera {name!r}: expected whole pixels as width and height, found {size[0]} x {size[1]}")
+    if not all(0 < length < 2**31 for length in size):
+        raise InputError(f"camera {name!r}: expected the size of an image, found {size[0]} x {size[1]}")
+    return int(size[0]), int(size[1])

@@ -16,7 +16,7 @@ from jaxtyping import Float64, UInt8
 from numba import njit
 
 from capture4d.cameras.board import Board
-from capture4d.cameras.projection import project, transform, undistort
+from capture4d.cameras.projection import camera_lens, project, transform, undistort
 from capture4d.settings import NonNegative, Range, Whole, settings
 from capture4d.types import Rig
 
@@ -71,7 +71,7 @@ def photograph_board(
     hands = _on_the_rim(size, config.hands, rng)
     local = transform(T_camera_board, _rim(size, config.margin_m))
     if local[:, 2].min() > NEAREST_M:
-        pixels = project(local, rig.intrinsics[camera], rig.distortion[camera])
+        pixels = project(local, camera_lens(rig, camera))
         low = np.clip(np.floor(pixels.min(axis=0)).astype(int) - 2, 0, (width, height))
         high = np.clip(np.ceil(pixels.max(axis=0)).astype(int) + 3, 0, (width, height))
         if (high > low).all():
@@ -110,18 +110,17 @@ def _inverse_lens(rig: Rig, camera: int, low: np.ndarray, high: np.ndarray) -> F
     columns, rows = (np.arange(0, length + 2 * LENS_STEP, LENS_STEP) - 0.5 for length in high - low)
     u, v = np.meshgrid(columns + low[0], rows + low[1])
     pixels = np.stack([u.ravel(), v.ravel()], axis=1)
-    return undistort(pixels, rig.intrinsics[camera], rig.distortion[camera]).reshape(*u.shape, 2)
+    return undistort(pixels, camera_lens(rig, camera)).reshape(*u.shape, 2)
 
 
 def _pattern(
     board: Board, config: BoardImageConfig, *, printed_side: bool
 ) -> tuple[Float64[np.ndarray, " across"], Float64[np.ndarray, " down"], Float64[np.ndarray, "rows columns"]]:
     """The sheet as cells of one grey level each: the lines between them in x and in y, metres, and the levels."""
-    opencv = board.opencv()
-    dictionary = opencv.getDictionary()
     cells = board.cells_per_marker
     border = (board.square_m - board.marker_m) / 2
-    within = np.concatenate([[0], border + np.arange(cells + 1) * board.marker_m / cells])
+    marks = border + np.arange(cells + 1) * board.marker_m / max(cells, 1)
+    within = np.concatenate([[0], marks[: 0 if board.plain else None]])
     x, y = (
         np.concatenate(
             [
@@ -139,13 +138,25 @@ def _pattern(
     per_square = len(within)
     squares = tones[2:-2, 2:-2].reshape(board.rows, per_square, board.columns, per_square).swapaxes(1, 2)
     squares[:] = config.ink
+    if board.plain:
+        squares[np.indices(squares.shape[:2]).sum(axis=0) % 2 == 1] = config.paper
+    else:
+        _print_markers(squares, board, config)
+    tones[2:-2, 2:-2] = squares.swapaxes(1, 2).reshape(board.rows * per_square, board.columns * per_square)
+    return x, y, tones
+
+
+def _print_markers(
+    squares: Float64[np.ndarray, "rows columns down across"], board: Board, config: BoardImageConfig
+) -> None:
+    """Onto squares that are all ink."""
+    opencv = board.opencv()
+    dictionary, cells = opencv.getDictionary(), board.cells_per_marker
     for marker, outline in zip(opencv.getIds().ravel(), opencv.getObjPoints(), strict=True):
         column, row = (np.asarray(outline)[:, :2].mean(axis=0) / board.square_m).astype(int)
         bits = dictionary.generateImageMarker(int(marker), cells) > 127
         squares[row, column] = config.paper
         squares[row, column, 1:-1, 1:-1] = np.where(bits, config.paper, config.ink)
-    tones[2:-2, 2:-2] = squares.swapaxes(1, 2).reshape(board.rows * per_square, board.columns * per_square)
-    return x, y, tones
 
 
 @no_type_check  # keeps the type-checking import hook off the functions that numba compiles

@@ -71,7 +71,9 @@ def shared_volume(rig: Rig) -> tuple[Float64[np.ndarray, " 3"], float]:
     across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
     centre = np.linalg.lstsq(across.sum(axis=0), np.einsum("cij,cj->i", across, rig.centres), rcond=None)[0]
     focal = rig.intrinsics[:, [0, 1], [0, 1]]
-    sine = np.sin(np.arctan(rig.image_sizes / (2 * focal))).min(axis=1)
+    half = rig.image_sizes / (2 * focal)
+    fisheye = np.array([lens == "fisheye" for lens in rig.lenses])[:, None]
+    sine = np.sin(np.where(fisheye, half.clip(max=np.pi / 2), np.arctan(half))).min(axis=1)
     return centre, float((np.linalg.norm(rig.centres - centre, axis=1) * sine).min())
 
 

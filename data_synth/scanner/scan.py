@@ -53,8 +53,10 @@ def scan_surfaces(
     Returns:
         The scan, and the true label of each of its vertices: 0 body, 1 garment, 2 painted border of the garment.
     """
-    if np.any(rig.distortion):
-        raise InputError("rig.distortion: the scanner needs undistorted cameras, found non-zero coefficients")
+    if np.any(rig.distortion) or "fisheye" in rig.lenses:
+        raise InputError(
+            "rig.distortion: the scanner needs undistorted cameras, found non-zero coefficients or fisheyes"
+        )
     if not surfaces:
         raise InputError("surfaces: expected at least one, found none")
     if config.sensor == "stereo":

@@ -21,6 +21,8 @@ from PIL import Image
 
 from capture4d.body.smpl import read_smpl
 from capture4d.cameras.colmap import read_model, write_model
+from capture4d.cameras.metashape import read_metashape
+from capture4d.cameras.nerfstudio import read_transforms
 from capture4d.captures.capture import Capture, read_capture, write_capture_description
 from capture4d.captures.garment_scans import load_garment_scan, save_garment_scan
 from capture4d.captures.truth import (
@@ -164,6 +166,22 @@ def smpl_npz(path: Path) -> None:
     np.savez(path, allow_pickle=False, **SMPL)
 
 
+def transforms(path: Path) -> None:
+    frames = [{"file_path": f"{name}.png", "transform_matrix": np.eye(4).tolist()} for name in RIG.names]
+    write_json(path, {"w": 64, "h": 48, "fl_x": 50.0, "cx": 32.5, "k1": 0.01, "frames": frames})
+
+
+def metashape(path: Path) -> None:
+    lens = "<resolution width='64' height='48'/><f>50</f><cx>0.5</cx><k1>0.01</k1><p1>1e-4</p1>"
+    sensor = f"<sensor id='0' type='frame'><calibration>{lens}</calibration></sensor>"
+    place = f"<transform>{' '.join(map(str, np.eye(4).ravel()))}</transform>"
+    camera = f"<camera id='0' sensor_id='0' label='front'>{place}</camera>"
+    path.write_text(
+        f"<document><chunk><sensors>{sensor}</sensors><cameras>{camera}</cameras>"
+        "<transform><scale>2.5</scale></transform></chunk></document>"
+    )
+
+
 def colmap(text: bool) -> Callable[[Path], None]:
     return lambda path: write_model(path.parent, RIG, text=text)
 
@@ -235,6 +253,8 @@ KINDS = [
     Kind("smpl.pkl", lambda path: path.write_bytes(pickle.dumps(SMPL, protocol=2)), read_smpl),
     Kind("text.pkl", lambda path: path.write_bytes(pickle.dumps(SMPL, protocol=0)), read_smpl),
     Kind("rig.json", lambda path: save_rig(path, RIG), load_rig),
+    Kind("transforms.json", transforms, read_transforms),
+    Kind("cameras.xml", metashape, read_metashape),
     Kind("any.json", lambda path: write_json(path, {"a": [1, 2.5, None], "b": {"c": "d"}}), read_json),
     Kind("rows.jsonl", lambda path: write_json_lines(path, [{"a": 1}, {"a": 2.5}]), read_json_lines),
     Kind("capture.json", capture, lambda path: read_capture(path.parent, scans=False)),
@@ -445,7 +465,7 @@ def test_arrays_of_another_kind_have_a_value_or_are_named(name: str) -> None:
             value_or_one_line(BY_NAME[name], whole(name) | {name: stream.getvalue()})
 
 
-@pytest.mark.parametrize("name", ["rig.json", "any.json", "rows.jsonl", "capture.json"])
+@pytest.mark.parametrize("name", ["rig.json", "transforms.json", "any.json", "rows.jsonl", "capture.json"])
 @given(
     value=st.recursive(
         st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
@@ -464,6 +484,11 @@ def test_arrays_of_another_kind_have_a_value_or_are_named(name: str) -> None:
                         "format",
                         "fps",
                         "frames",
+                        "file_path",
+                        "transform_matrix",
+                        "w",
+                        "h",
+                        "fl_x",
                         "units",
                         "garment_colour",
                         "boundary_colours",
@@ -485,6 +510,6 @@ def test_json_of_any_shape_has_a_value_or_is_named(name: str, value: Any) -> Non
 
 
 def test_json_of_any_depth_is_named() -> None:
-    for name in ("rig.json", "any.json", "rows.jsonl", "capture.json"):
+    for name in ("rig.json", "transforms.json", "any.json", "rows.jsonl", "capture.json"):
         for text in (b"[" * 100_000, b'{"a":' * 100_000 + b"1" + b"}" * 100_000):
             assert "not valid JSON" in value_or_one_line(BY_NAME[name], whole(name) | {name: text})

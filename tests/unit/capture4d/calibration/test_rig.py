@@ -7,6 +7,7 @@ import pytest
 
 from benchmarks.simulated_views import calibration_rig, simulate_views
 from capture4d.calibration.adjustment import RigEstimate, adjust_rig, view_residuals
+from capture4d.calibration.check import check_rig
 from capture4d.calibration.config import CalibrationConfig
 from capture4d.calibration.report import calibration_report, coverage_grid, rig_difference, rigid_alignment
 from capture4d.calibration.rig import Calibration, calibrate_rig
@@ -160,6 +161,23 @@ def test_the_report_tells_what_to_film_next():
     assert np.array_equal(np.diag(report["shared_poses"]), [row["poses"] for row in report["cameras"]])
 
 
+def test_the_scale_of_a_pose_does_not_depend_on_how_the_board_is_held():
+    """Of few corners, far from symmetric, the median of each coordinate moves with the axes."""
+    rig, _, views = scene(0, 0.01)
+    few = [replace(view, ids=view.ids[view.ids < 20], pixels=view.pixels[view.ids < 20]) for view in views]
+    few = [view for view in few if BOARD.is_fixed_by(view.ids)]
+    calibration = calibrated(rig, views)
+    report = calibration_report(
+        replace(calibration, views=few),
+        BOARD,
+        pose_names=[f"{pose:03d}" for pose in range(POSES)],
+        config=CalibrationConfig(hold_out=0, flatness=False),
+    )
+    scales = [row["scale_ppm"] for row in report["volume"] if row["scale_ppm"] is not None]
+    assert len(scales) > 4
+    assert np.abs(scales).max() < 500
+
+
 def test_the_scale_is_the_boards():
     """A board printed 1 % too small makes a rig 1 % too large; nothing in the images tells."""
     rig, _, views = scene(0, 0.03)
@@ -209,3 +227,79 @@ def test_alignment_undoes_a_movement(seed: int):
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = rotation_from_vector(rng.normal(size=3)), rng.normal(size=3)
     np.testing.assert_allclose(rigid_alignment(points, transform(T, points)), T, atol=1e-12)
+
+
+# --- fisheyes ----------------------------------------------------------------------------------------------------
+
+
+def fisheye_scene(seed: int, noise_px: float) -> tuple[Rig, np.ndarray, list[BoardView]]:
+    """Cameras of more than 110 degrees from corner to corner, near the board."""
+    rng = np.random.default_rng(seed)
+    rig = calibration_rig(4, rng=rng, arc_deg=100, distance_m=1.2, focal_px=620.0)
+    bent = np.zeros((4, 5))
+    bent[:, :4] = [0.03, -0.01, 4e-3, -1e-3] + rng.normal(size=(4, 4)) * [0.02, 8e-3, 2e-3, 4e-4]
+    rig = replace(rig, distortion=bent, lenses=("fisheye",) * 4)
+    poses = wave_board(BOARD, POSES, rng=rng, arc_deg=100, volume_m=(1.2, 1.2, 1.2))
+    return rig, poses, simulate_views(rig, BOARD, poses, errors=[noise_px * rng.normal(size=(2000, 2))], rng=rng)
+
+
+def fisheye_calibrated(rig: Rig, views: list[BoardView]) -> Calibration:
+    config = CalibrationConfig(lens="fisheye", flatness=False)
+    return calibrate_rig(views, BOARD, names=rig.names, image_sizes=rig.image_sizes, poses=POSES, config=config)
+
+
+def test_a_rig_of_fisheyes_is_found_exactly_without_noise():
+    rig, poses, views = fisheye_scene(0, 0.0)
+    calibration = fisheye_calibrated(rig, views)
+    distances, angles = rig_difference(calibration.estimate, RigEstimate(rig, poses, BOARD.corners))
+    assert calibration.estimate.rig.lenses == rig.lenses
+    assert distances.max() < 1e-6
+    assert angles.max() < 1e-5
+    np.testing.assert_allclose(calibration.estimate.rig.distortion, rig.distortion, atol=1e-4)
+
+
+def test_a_rig_of_fisheyes_is_as_good_as_predicted():
+    """And a start is good to a few millimetres, which the adjustment makes hundredths."""
+    ratios = []
+    for seed in range(3):
+        rig, poses, views = fisheye_scene(seed, 0.05)
+        calibration = fisheye_calibrated(rig, views)
+        truth = RigEstimate(rig, poses, BOARD.corners)
+        distances, _ = rig_difference(calibration.estimate, truth)
+        started, _ = rig_difference(calibration.start, truth)
+        ratios.append((distances**2).sum() / (centre_sigma_m(calibration.covariance) ** 2).sum())
+        assert abs(calibration.noise_px / 0.05 - 1) < 0.1
+        assert distances.max() < 3e-4
+        assert distances.max() < started.max() < 5e-3
+        wrong = replace(calibration.estimate.rig, lenses=("brown",) * 4)
+        residuals = view_residuals(replace(calibration.estimate, rig=wrong), views[0])
+        assert np.abs(residuals).max() > 5, "the lens decides"
+    assert 0.4 < np.sqrt(np.mean(ratios)) < 1.8
+
+
+def test_a_fisheye_that_moves_is_found():
+    rig, _, views = fisheye_scene(1, 0.05)
+    calibration = fisheye_calibrated(rig, views)
+    rng = np.random.default_rng(5)
+    moved = rig.T_camera_world.copy()
+    moved[2, :3] = rotation_from_vector(np.radians([0.1, 0.1, 0])) @ moved[2, :3]
+    after = replace(rig, T_camera_world=moved)
+    errors = [0.05 * rng.normal(size=(2000, 2))]
+    for these, expected in ((rig, []), (after, ["cam02"])):
+        while True:
+            pose = wave_board(BOARD, 1, rng=rng, arc_deg=100, volume_m=(0.6, 0.6, 0.6))
+            seen = simulate_views(these, BOARD, pose, errors=errors, rng=rng)
+            if len(seen) == 4:
+                break
+        checks = check_rig(calibration.estimate.rig, seen, BOARD, covariance=calibration.covariance)
+        assert [check.name for check in checks if check.verdict == "moved"] == expected
+
+
+def test_views_that_fix_no_fisheye_are_named():
+    rig, _, views = fisheye_scene(0, 0.05)
+    rng = np.random.default_rng(0)
+    noise = [
+        replace(view, pixels=rng.uniform(0, 1000, view.pixels.shape)) if view.camera == 1 else view for view in views
+    ]
+    with pytest.raises(InputError, match="camera cam01: expected board views that fix"):
+        fisheye_calibrated(rig, noise)

@@ -12,8 +12,9 @@ import pytest
 from benchmarks.simulated_views import calibration_rig
 from capture4d.calibration import stage as calibration_stage
 from capture4d.calibration.adjustment import RigEstimate
+from capture4d.calibration.board_images import find_images
 from capture4d.calibration.report import rig_difference
-from capture4d.calibration.stage import find_images, read_covariance
+from capture4d.calibration.stage import read_covariance
 from capture4d.cameras.board import parse_board
 from capture4d.cameras.projection import rotation_from_vector
 from capture4d.errors import InputError

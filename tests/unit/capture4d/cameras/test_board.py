@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from capture4d.cameras.board import Board, parse_board
+from capture4d.cameras.board import Board, format_board, parse_board
 from capture4d.errors import InputError
 
 SPEC = "charuco:14x10:60:44:DICT_5X5_100"
@@ -28,6 +28,15 @@ def test_corners_are_opencvs():
         ("charuco:14x10:44:60:DICT_5X5_100", "a marker smaller than its square, found 60 and 44 mm"),
         ("charuco:14x10:nan:44:DICT_5X5_100", "a marker smaller than its square"),
         ("charuco:14x10:60:44:DICT_5X5_99", "expected a dictionary of DICT_4X4_100"),
+        ("checkerboard:10x7", "expected a board such as charuco:14x10"),
+        ("checkerboard:10x7:25:20", "expected a board such as"),
+        ("checkerboard:10x7:25:legacy", "expected a board such as"),
+        ("checkerboard:10x:25", "checkerboard:10x7:25, found 'checkerboard:10x:25'"),
+        ("checkerboard:10x3:25", "at least 4x4 squares of a checkerboard, found 10x3"),
+        ("checkerboard:10x7:0", "the size of a square, found 0 mm"),
+        ("checkerboard:10x7:inf", "the size of a square, found inf mm"),
+        ("checkerboard:10x8:25", "an odd and an even number of squares, for another looks the same upside down"),
+        ("checkerboard:9x7:25", "and cameras take it for two; found 9x7"),
         ("charuco:14x10:60:44:DICT_4X4_50", "14x10 squares need 70 markers, DICT_4X4_50 has 50"),
     ],
 )
@@ -50,6 +59,22 @@ def test_white_squares_are_opencvs(rows: int, legacy: bool):
     top_left = [(int(corner % 7), int(corner // 7)) for corner in ids]
     np.testing.assert_array_equal(board.paper_falls(ids), [square in white for square in top_left])
     assert board.cells_per_marker == 6
+
+
+@pytest.mark.parametrize(
+    "spec", [SPEC, f"{SPEC}:legacy", "checkerboard:10x7:25", "charuco:5x7:12.5:9.25:DICT_APRILTAG_36h11"]
+)
+def test_a_board_is_written_as_it_is_read(spec: str):
+    assert format_board(parse_board(spec)) == spec
+
+
+def test_a_checkerboard_has_the_corners_of_a_board_with_markers():
+    plain, marked = parse_board("checkerboard:10x7:25"), parse_board("charuco:10x7:25:20:DICT_4X4_50")
+    np.testing.assert_array_equal(plain.corners, marked.corners)
+    ids = np.arange(len(plain.corners), dtype=np.int32)
+    np.testing.assert_array_equal(plain.paper_falls(ids), marked.paper_falls(ids))
+    assert plain.plain
+    assert not marked.plain
 
 
 def test_corners_on_a_line_do_not_fix_a_board():

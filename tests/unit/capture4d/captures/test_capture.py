@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.simulated_views import calibration_rig
 from capture4d.captures.capture import (
     Capture,
     capture_digest,
@@ -32,7 +33,7 @@ from capture4d.colours.spaces import format_colour, parse_colour
 from capture4d.errors import InputError
 from capture4d.files.records import load_body, load_garment, load_rig, save_body, save_garment, save_poses, save_rig
 from capture4d.mesh_files.meshes import write_mesh
-from capture4d.types import Body, Garment, Mesh, PoseSequence, Rig, Scan
+from capture4d.types import Body, Garment, Mesh, PoseSequence, Scan
 
 FRAMES = (11, 12, 15)
 SQUARE = Mesh(
@@ -242,9 +243,7 @@ def test_bodies_garments_and_rigs_come_back(tmp_path: Path):
         {"hem": np.array([0, 1], np.int32), "cuff_left": np.array([2], np.int32)},
         skin_weights=weights,
     )
-    rig = Rig(
-        ("a", "b"), rng.random((2, 3, 3)), np.zeros((2, 5)), rng.random((2, 4, 4)), np.full((2, 2), 512, np.int32)
-    )
+    rig = replace(calibration_rig(2, rng=rng), lenses=("brown", "fisheye"))
     save_body(tmp_path / "body.npz", body)
     save_garment(tmp_path / "garment.npz", garment)
     save_rig(tmp_path / "rig.json", rig)

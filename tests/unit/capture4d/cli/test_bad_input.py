@@ -115,7 +115,7 @@ def broken_rigs(folder: Path) -> dict[str, str]:
     return {
         "not valid JSON": json.dumps(good)[:-40],
         "expected the entry 'intrinsics' for every camera, found none": json.dumps(without),
-        "inhomogeneous shape": json.dumps(bent),
+        "camera 'cam00': expected 4 x 4 numbers as T_camera_world, found 2 x 2": json.dumps(bent),
         "Rig.intrinsics": json.dumps(lost),
         "expected the entry 'cameras'": json.dumps({"rig": []}),
         "expected a JSON object": "[]",

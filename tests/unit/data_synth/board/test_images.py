@@ -7,7 +7,7 @@ import pytest
 
 from capture4d.calibration.corners import detect_corners
 from capture4d.cameras.board import parse_board
-from capture4d.cameras.projection import rotation_from_vector, undistort
+from capture4d.cameras.projection import camera_lens, rotation_from_vector, undistort
 from capture4d.types import Rig
 from data_synth.board.images import BoardImageConfig, photograph_board
 
@@ -78,7 +78,7 @@ def test_a_pixel_is_the_mean_of_the_pattern_in_it(rig: Rig):
     image = shot(rig, pose)[220 : 220 + side, 300 : 300 + side]
     along = (np.arange(side * fine) + 0.5) / fine - 0.5
     pixels = np.stack(np.meshgrid(300 + along, 220 + along), axis=-1).reshape(-1, 2)
-    rays = np.concatenate([undistort(pixels, rig.intrinsics[0], rig.distortion[0]), np.ones((len(pixels), 1))], axis=1)
+    rays = np.concatenate([undistort(pixels, camera_lens(rig, 0)), np.ones((len(pixels), 1))], axis=1)
     T_board_camera = np.linalg.inv(pose)
     rays = rays @ T_board_camera[:3, :3].T
     met = T_board_camera[:3, 3] - T_board_camera[2, 3] / rays[:, 2:] * rays

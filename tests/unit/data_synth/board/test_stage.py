@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from capture4d.calibration.adjustment import RigEstimate
+from capture4d.calibration.board_images import find_images
 from capture4d.calibration.report import rig_difference
-from capture4d.calibration.stage import find_images
 from capture4d.calibration.stage import run as calibrate
 from capture4d.errors import InputError
 from capture4d.files.records import load_rig, save_rig
