@@ -12,7 +12,7 @@ import numpy as np
 from capture4d.errors import InputError
 from capture4d.files.arrays import ArrayFile
 from capture4d.files.atomic import file_digest
-from capture4d.mesh_files.meshes import MESH_SUFFIXES, read_mesh
+from capture4d.mesh_files.meshes import READABLE, read_mesh
 from capture4d.types import Mesh
 
 __all__ = ["MeshSequence", "open_sequence"]
@@ -72,7 +72,7 @@ def open_sequence(path: Path) -> MeshSequence:
         raise InputError(f"expected a folder of mesh files or an npz, found {found}", where=path)
     files: dict[int, Path] = {}
     for file in sorted(path.iterdir()):
-        if file.suffix.lower() not in MESH_SUFFIXES:
+        if file.suffix.lower() not in READABLE:
             continue
         numbers = re.findall(r"\d+", file.stem)
         if not numbers:
@@ -81,5 +81,5 @@ def open_sequence(path: Path) -> MeshSequence:
         if other != file:
             raise InputError(f"has the frame number {int(numbers[-1])} of {other.name}", where=file)
     if not files:
-        raise InputError(f"expected mesh files ({', '.join(MESH_SUFFIXES)}), found none", where=path)
+        raise InputError(f"expected mesh files ({', '.join(READABLE)}), found none", where=path)
     return MeshSequence(path, dict(sorted(files.items())))

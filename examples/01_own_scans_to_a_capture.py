@@ -18,7 +18,7 @@ from capture4d.captures.capture import Capture, write_capture_description
 from capture4d.colours.spaces import parse_colour
 from capture4d.files.records import save_garment
 from capture4d.geometry.mesh import boundary_loops
-from capture4d.mesh_files.meshes import MESH_SUFFIXES, read_mesh
+from capture4d.mesh_files.meshes import READABLE, read_mesh
 from capture4d.types import Garment
 
 
@@ -32,7 +32,7 @@ def main() -> None:
     parser.add_argument("--fps", type=float, default=60.0)
     options = parser.parse_args()
 
-    files = sorted(path for path in options.scans.iterdir() if path.suffix.lower() in MESH_SUFFIXES)
+    files = sorted(path for path in options.scans.iterdir() if path.suffix.lower() in READABLE)
     numbers = [re.findall(r"\d+", path.stem) for path in files]
     frame_ids = [int(found[-1]) for found in numbers] if all(numbers) else list(range(1, len(files) + 1))
     (options.capture / "scans").mkdir(parents=True, exist_ok=True)

@@ -18,7 +18,7 @@ from capture4d.colours.spaces import parse_colour
 from capture4d.errors import InputError
 from capture4d.files.atomic import nan_to_none, write_json
 from capture4d.geometry.mesh import boundary_loops, submesh
-from capture4d.mesh_files.meshes import MESH_SUFFIXES, read_mesh, write_mesh
+from capture4d.mesh_files.meshes import WRITABLE, read_mesh, write_mesh
 from capture4d.types import Garment, GarmentScan, Mesh
 from capture4d.units import METRES, Units
 from registration.alignment import Similarity, align
@@ -67,9 +67,9 @@ def run(
             the sizes cannot belong to one unit.
     """
     begin = time.process_time()
-    if output_path.suffix.lower() not in MESH_SUFFIXES:
+    if output_path.suffix.lower() not in WRITABLE:
         raise InputError(
-            f"expected a mesh file ({', '.join(MESH_SUFFIXES)}), found '{output_path.suffix}'", where=output_path
+            f"expected a mesh file ({', '.join(WRITABLE)}), found '{output_path.suffix}'", where=output_path
         )
     template_file, scan_file = read_mesh(template_path), read_mesh(scan_path)
     result = register_mesh(

@@ -34,7 +34,7 @@ from capture4d.files.records import (
     load_rig,
 )
 from capture4d.geometry.mesh import boundary_loops
-from capture4d.mesh_files.meshes import MESH_SUFFIXES, read_coloured_mesh, read_mesh, write_mesh
+from capture4d.mesh_files.meshes import READABLE, read_coloured_mesh, read_mesh, write_mesh
 from capture4d.types import Body, Garment, PoseSequence, Rig, Scan
 from capture4d.units import METRES, Units
 
@@ -371,7 +371,7 @@ def template_path(capture: Capture) -> Path:
     Raises:
         InputError: there is none.
     """
-    for suffix in (".npz", *MESH_SUFFIXES):
+    for suffix in (".npz", *READABLE):
         path = capture.path / f"template{suffix}"
         if path.is_file():
             return path

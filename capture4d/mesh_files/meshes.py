@@ -24,23 +24,27 @@ from capture4d.mesh_files.polygons import MeshFile
 from capture4d.mesh_files.textures import named_texture, texture_colours
 from capture4d.types import Mesh
 
-__all__ = ["MESH_SUFFIXES", "MeshFile", "read_coloured_mesh", "read_mesh", "write_mesh"]
+__all__ = ["READABLE", "WRITABLE", "MeshFile", "read_coloured_mesh", "read_mesh", "write_mesh"]
 
-MESH_SUFFIXES = (".obj", ".ply", ".glb")
+READABLE = (".obj", ".ply", ".glb", ".gltf", ".stl", ".off")
+"""Endings of the files that are read, whatever their case."""
+WRITABLE = (".obj", ".ply", ".glb")
 
 
-def read_mesh(path: str | Path) -> MeshFile:
+def read_mesh(path: str | Path, *, faces_needed: bool = True) -> MeshFile:
     """Read a mesh.
 
+    Args:
+        faces_needed: whether vertices without a face, a point cloud, are a fault.
     Raises:
         InputError: the file is missing, damaged, of an unknown format, or holds no triangle or a NaN.
     """
     path = Path(path)
     with reading(path, "mesh file", absent="no such mesh file"):
-        return _whole(_read(path))
+        return _whole(_read(path), faces_needed)
 
 
-def read_coloured_mesh(path: str | Path) -> MeshFile:
+def read_coloured_mesh(path: str | Path, *, faces_needed: bool = True) -> MeshFile:
     """Read a mesh with a colour per vertex: those of the file, else its texture's at the vertices, else None.
 
     A texture is the one image that an obj's mtl file names as map_Kd, a ply's `comment TextureFile`, or what a glb
@@ -51,9 +55,9 @@ def read_coloured_mesh(path: str | Path) -> MeshFile:
     """
     path = Path(path)
     with reading(path, "mesh file", absent="no such mesh file"):
-        if path.suffix.lower() == ".glb":
-            return _whole(read_coloured_glb(path))
-        found = _whole(_read(path))
+        if path.suffix.lower() in (".glb", ".gltf"):
+            return _whole(read_coloured_glb(path), faces_needed)
+        found = _whole(_read(path), faces_needed)
         if found.colours is not None:
             return found
         picture = named_texture(path)
@@ -68,20 +72,20 @@ def _read(path: Path) -> MeshFile:
             return read_obj(path)
         case ".ply":
             return read_ply(path)
-        case ".glb":
+        case ".glb" | ".gltf":
             return read_glb(path)
         case _:
-            raise _unknown(path)
+            raise _unknown(path, READABLE)
 
 
-def _whole(found: MeshFile) -> MeshFile:
-    if not len(found.mesh.faces):
+def _whole(found: MeshFile, faces_needed: bool) -> MeshFile:
+    if not len(found.mesh.faces) and (faces_needed or not len(found.mesh.vertices)):
         raise EmptyMeshError(f"empty mesh, found {len(found.mesh.vertices)} vertices and no faces")
     return found
 
 
-def _unknown(path: Path) -> InputError:
-    return InputError(f"expected a mesh file ({', '.join(MESH_SUFFIXES)}), found '{path.suffix}'", where=path)
+def _unknown(path: Path, suffixes: tuple[str, ...]) -> InputError:
+    return InputError(f"expected a mesh file ({', '.join(suffixes)}), found '{path.suffix}'", where=path)
 
 
 def write_mesh(
@@ -105,5 +109,5 @@ def write_mesh(
         case ".glb":
             data = glb_bytes(mesh, colours)
         case _:
-            raise _unknown(path)
+            raise _unknown(path, WRITABLE)
     write_bytes(path, data)

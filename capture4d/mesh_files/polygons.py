@@ -23,6 +23,8 @@ class MeshFile:
     """sRGB per vertex."""
     polygon_sizes: Int32[np.ndarray, " polygons"] | None = None
     """Corners of each face of the file; None if all are triangles."""
+    notes: tuple[str, ...] = ()
+    """What in the file could not be used, though the rest could: a line each, as for a person."""
 
 
 def fan_corners(sizes: np.ndarray) -> Integer[np.ndarray, "tris 3"]:

@@ -22,7 +22,7 @@ from capture4d.colours.spaces import format_colour, parse_colour
 from capture4d.errors import InputError
 from capture4d.files.atomic import write_json
 from capture4d.files.records import load_poses, save_poses, save_rig
-from capture4d.mesh_files.meshes import MESH_SUFFIXES, read_mesh, write_mesh
+from capture4d.mesh_files.meshes import READABLE, WRITABLE, read_mesh, write_mesh
 from capture4d.preflight.check import Checked
 from capture4d.preflight.facts import BadFrame
 from capture4d.preflight.statistics import outwardness
@@ -125,14 +125,15 @@ def _copy_companions(checked: Checked, output: Path) -> None:
     if take.poses_path is not None:
         poses, lift = load_poses(take.poses_path), np.array([0, checked.survey.poses_lift_m, 0], np.float32)
         save_poses(output / "poses.npz", replace(poses, translations=poses.translations + lift))
-    for suffix in MESH_SUFFIXES:
+    for suffix in READABLE:
         bare = take.path / f"template{suffix}"
         if bare.is_file():
             found = read_mesh(bare)
             # Whichever way the faces of the scans wind, its own have to look outwards in the end.
             own = replace(placement, flip=(outwardness(found.mesh) < 0) != placement.mirrors)
             sizes = None if own.flip else found.polygon_sizes
-            write_mesh(output / bare.name, place(found.mesh, own), colours=found.colours, polygon_sizes=sizes)
+            name = bare.name if suffix in WRITABLE else "template.ply"
+            write_mesh(output / name, place(found.mesh, own), colours=found.colours, polygon_sizes=sizes)
     if take.rig is not None:
         factor = placement.scale / take.facts.declared
         save_rig(output / "rig.json", place_rig(take.rig, placement, scale=factor) if checked.rig_moves else take.rig)

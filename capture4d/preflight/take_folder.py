@@ -21,7 +21,7 @@ from capture4d.errors import EmptyMeshError, InputError, NotFiniteError
 from capture4d.files.atomic import read_json
 from capture4d.files.records import load_body, load_poses, load_rig
 from capture4d.geometry.mesh import doubled_area_vectors
-from capture4d.mesh_files.meshes import MESH_SUFFIXES, read_coloured_mesh
+from capture4d.mesh_files.meshes import READABLE, read_coloured_mesh
 from capture4d.mesh_files.polygons import MeshFile
 from capture4d.preflight.facts import BadFrame, Paints, TakeFacts
 from capture4d.types import PoseSequence, Rig
@@ -84,7 +84,7 @@ def open_take(path: Path, claims: Claims | None = None) -> TakeFolder:
     folder = path / "scans" if (path / "scans").is_dir() else path
     found = _numbered_files(folder, claims.frames)
     if not found:
-        wanted = claims.frames or f"files with a frame number ({', '.join(MESH_SUFFIXES)})"
+        wanted = claims.frames or f"files with a frame number ({', '.join(READABLE)})"
         raise InputError(f"expected scans named {wanted}, found none", where=folder)
     files = {number: names[0] for number, names in sorted(found.items())}
     poses_path, body_path = (
@@ -120,7 +120,7 @@ def _numbered_files(folder: Path, pattern: str | None) -> dict[int, list[Path]]:
         named = re.compile(r".*?(\d+)\D*")
     files: dict[int, list[Path]] = {}
     for file in sorted(folder.iterdir()):
-        if file.suffix.lower() not in MESH_SUFFIXES or not file.is_file() or file.stem.startswith("template"):
+        if file.suffix.lower() not in READABLE or not file.is_file() or file.stem.startswith("template"):
             continue
         match = named.fullmatch(file.name if pattern is not None else file.stem)
         if match:
