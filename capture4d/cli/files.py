@@ -22,7 +22,7 @@ class Template:
     """Make a template of your own garment mesh, or of a part of the body: bound, its borders named, its UVs checked."""
 
     mesh: Annotated[Positional[Path | None], arg(metavar="MESH")] = None
-    """Garment mesh that lies on the body: obj, ply or glb. Left out with --region."""
+    """Garment mesh that lies on the body: obj, ply, glb, gltf, stl or off. Left out with --region."""
     output: Path
     """template.npz to write, as in a capture folder."""
     body: Path | None = None
@@ -63,9 +63,9 @@ class RegisterMesh:
     """Register any template to any scan, two mesh files; writes the result, and its measures as JSON beside it."""
 
     template: Annotated[Positional[Path], arg(metavar="TEMPLATE")]
-    """Mesh to deform: obj, ply or glb. Its vertex order and faces are kept."""
+    """Mesh to deform: obj, ply, glb, gltf, stl or off. Its vertex order and faces are kept."""
     scan: Annotated[Positional[Path], arg(metavar="SCAN")]
-    """Mesh to fit it to: obj, ply or glb."""
+    """Mesh to fit it to: obj, ply, glb, gltf, stl or off; a point cloud gets faces between its points."""
     output: Path
     """Mesh to write: ply, obj or glb; the JSON has the same name."""
     config: Annotated[MeshRegistrationConfig, arg(name="")] = field(default_factory=MeshRegistrationConfig)
@@ -75,6 +75,8 @@ class RegisterMesh:
 
         result = pipeline.register_mesh(self.template, self.scan, self.output, self.config)
         print(f"registered: {self.output}, measures: {self.output.with_suffix('.json')}")
+        if result.estimated:
+            print(f"capture4d: {self.scan}: points without faces; normals and faces are estimated", file=sys.stderr)
         quality = result.quality
         if quality.verdict != "good":
             print(f"capture4d: {self.output}: {quality.verdict}: {'; '.join(quality.reasons)}", file=sys.stderr)

@@ -11,7 +11,7 @@ Ball-Pivoting Algorithm for Surface Reconstruction (IEEE TVCG 1999). Both as ope
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float, Int32
+from jaxtyping import Float, Float64, Int32
 from scipy.spatial import KDTree
 
 from capture4d.errors import InputError
@@ -26,9 +26,12 @@ NEIGHBOURS = 16
 """Points that tell a normal."""
 SPACING_NEIGHBOUR = 6
 """A sample's distance to this neighbour is the spacing of the samples: on a surface six lie around each."""
-BALL_RADII = (0.75, 1.0, 1.5)
-"""Of the ball, in spacings, one after the other. The largest bridges gaps of three samples, as scans of even density have
-them everywhere, and no more: what is open farther is a hole, or a border. (See tests of the module for what it closes.)"""
+PASSES = 2
+"""How often points are drawn to the plane of their neighbours before the ball rolls. It falls through noise: of a
+sphere whose points are off by a quarter of their distance a quarter is left out without, one in 6,000 after two."""
+BALL_RADII = (1.0, 1.5)
+"""Of the ball, in spacings, one after the other."""
+_AT_ONCE = 100_000
 
 
 def faces_between(points: Float[np.ndarray, "V 3"]) -> Int32[np.ndarray, "F 3"]:
@@ -50,12 +53,14 @@ def faces_between(points: Float[np.ndarray, "V 3"]) -> Int32[np.ndarray, "F 3"]:
         raise InputError(f"expected the points of a surface, found most of {len(places)} in one place")
     places = (places - places.mean(axis=0)) / spacing
     geometry, utility = import_open3d().geometry, import_open3d().utility
-    cloud = geometry.PointCloud(utility.Vector3dVector(places))
+    cloud = geometry.PointCloud(utility.Vector3dVector(_smoothed(places)))
     cloud.estimate_normals(geometry.KDTreeSearchParamKNN(NEIGHBOURS))
     try:
         cloud.orient_normals_consistent_tangent_plane(NEIGHBOURS)
     except RuntimeError:  # its triangulation wants points that are not all in one plane
-        raise InputError(f"expected the points of a surface in space, found {len(places)} in one plane or line") from None
+        raise InputError(
+            f"expected the points of a surface in space, found {len(places)} in one plane or line"
+        ) from None
     surface = geometry.TriangleMesh.create_from_point_cloud_ball_pivoting(cloud, utility.DoubleVector(BALL_RADII))
     faces = np.asarray(surface.triangles).reshape(-1, 3)
     if not len(faces):
@@ -72,3 +77,19 @@ def _outwardness(points: np.ndarray, faces: np.ndarray) -> float:
     size = np.linalg.norm(areas, axis=1, keepdims=True)
     middle = (size * centres).sum(axis=0) / max(float(size.sum()), 1e-300)
     return float(((centres - middle) * areas).sum())
+
+
+def _smoothed(points: Float64[np.ndarray, "V 3"]) -> Float64[np.ndarray, "V 3"]:
+    """Each point on the plane through its neighbours."""
+    for _ in range(PASSES):
+        tree, moved = KDTree(points), np.empty_like(points)
+        for start in range(0, len(points), _AT_ONCE):
+            own = points[start : start + _AT_ONCE]
+            near = points[tree.query(own, k=NEIGHBOURS)[1]]
+            middle = near.mean(axis=1)
+            offset = near - middle[:, None]
+            normal = np.linalg.eigh(np.einsum("pni,pnj->pij", offset, offset))[1][:, :, 0]
+            height = np.einsum("pi,pi->p", own - middle, normal)
+            moved[start : start + _AT_ONCE] = own - height[:, None] * normal
+        points = moved
+    return points

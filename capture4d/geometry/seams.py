@@ -1,9 +1,9 @@
 """Seams: vertices that a file splits for texture coordinates, normals or materials, joined for topology.
 
-Many formats keep one texture coordinate or normal per vertex (glb always, ply as Blender writes it, stl shares no vertex
-at all), so a surface lies in the file as pieces whose edges coincide. Pieces are sewn edge by edge: two open edges in
-one place whose faces lie on both sides of it, wound alike, and no third one. That is all that is joined. Borders that
-touch in a point, a lining that lies on its cloth, and edges where three sheets meet stay as they are.
+Many formats keep one texture coordinate or normal per vertex (glb always, ply as Blender writes it; stl shares no
+vertex at all), so a surface lies in the file as pieces whose edges coincide. Pieces are sewn edge by edge: two open
+edges in one place whose faces lie on both sides of it, wound alike, and no third one. That is all that is joined.
+Borders that touch in a point, a lining that lies on its cloth, and edges where three sheets meet stay as they are.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from capture4d.types import Mesh
 __all__ = ["Welded", "weld", "welded_mesh"]
 
 ROUNDING = 4 * float(np.finfo(np.float32).eps)
-"""Largest distance of the two copies of a vertex, over the largest coordinate. Most writers copy them bit for bit; where
-each piece was moved by a matrix of its own (a glb's nodes, quantised integers), three products and three sums may round
-differently. Half a micrometre on a person: no two layers of cloth are so near along a whole edge."""
+"""Largest distance of the two copies of a vertex, over the largest coordinate. Most writers copy them bit for bit;
+where each piece was moved by a matrix of its own (a glb's nodes, quantised integers), three products and three sums may
+round differently. Half a micrometre on a person: no two layers of cloth are so near along a whole edge."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -28,6 +28,7 @@ from capture4d.preflight.facts import BadFrame
 from capture4d.preflight.statistics import outwardness
 from capture4d.preflight.take_folder import TakeFolder, read_frame
 from capture4d.runs.workers import run_jobs
+from capture4d.types import Mesh
 
 __all__ = ["fixed_path", "write_fixed"]
 
@@ -108,9 +109,9 @@ def _rewrite(job: _Job) -> int:
     if isinstance(found, BadFrame):
         return -1
     mesh = place(found.mesh, job.placement)
-    write_mesh(
-        job.target, mesh if found.colours is None else type(mesh)(mesh.vertices, mesh.faces), colours=found.colours
-    )
+    faces = mesh.faces[:0] if found.estimated else mesh.faces  # what was guessed is not made a fact
+    uv = mesh.uv if found.colours is None else None
+    write_mesh(job.target, Mesh(mesh.vertices, faces, uv), colours=found.colours)
     return job.frame_id
 
 

@@ -92,7 +92,7 @@ def test_colours_round_trip():
     [
         (lambda entries: entries.pop("fps"), "expected the entry 'fps'"),
         (lambda entries: entries.update(fps=0), "expected a positive frame rate, found 0"),
-        (lambda entries: entries.update(fps="fast"), "could not convert"),
+        (lambda entries: entries.update(fps="fast"), "fps: expected a number, found 'fast'"),
         (lambda entries: entries.update(format=7), "expected format 1, found 7"),
         (lambda entries: entries.update(units="inch"), "expected units m, cm, mm, in, found 'inch'"),
         (lambda entries: entries.update(garment_colour="blue"), "expected a colour such as #2f62c9, found 'blue'"),

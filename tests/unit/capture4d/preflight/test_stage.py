@@ -477,7 +477,7 @@ def test_a_folder_of_scans_is_enough(sound: dict[int, Scan], tmp_path: Path, cap
         ([], "{", "not valid JSON"),
         ([], "[]", "expected a JSON object"),
         ([], '{"fps": -1}', "expected a positive frame rate"),
-        ([], '{"units": "furlong"}', "expected one of m, cm, mm, in"),
+        ([], '{"units": "furlong"}', "expected units m, cm, mm, in"),
         ([], '{"garment_colour": "blue"}', "expected a colour such as"),
     ],
 )
