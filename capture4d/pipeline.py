@@ -30,7 +30,6 @@ from wrinkles.offset_images.config import OffsetConfig
 if TYPE_CHECKING:
     from capture4d.calibration.check import CameraCheck
     from capture4d.calibration.stage import CalibrationResult
-    from capture4d.extraction.stage import ExtractionResult
     from capture4d.preflight.check import Checked
     from capture4d.preflight.take_folder import Claims
     from capture4d.templates.stage import TemplateResult
@@ -67,7 +66,7 @@ AnyWork: TypeAlias = WorkFolder | Place
 
 def extract(
     capture: AnyCapture, work: AnyWork, *, learn_colours: bool = False, workers: int = 1, overwrite: bool = False
-) -> ExtractionResult:
+) -> StageResult:
     """Cut the garment out of every scan by its colour, and find its painted borders: WORK/garment.
 
     Args:

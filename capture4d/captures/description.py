@@ -6,7 +6,6 @@ not known are left alone.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, get_args
@@ -82,7 +81,7 @@ def _fps(value: object) -> float:
         raise InputError(f"fps: expected a number, found {_shown(value)}")
     if not value > 0:
         raise InputError(f"fps: expected a positive frame rate, found {_shown(value)}")
-    if math.isnan(value) or not FPS[0] <= value <= FPS[1]:
+    if not FPS[0] <= value <= FPS[1]:
         raise InputError(f"fps: expected a frame rate from {FPS[0]:g} to {FPS[1]:g}, found {_shown(value)}")
     return float(value)
 
@@ -95,10 +94,13 @@ def _units(value: object) -> Units:
 
 
 def _colour(value: Any, entry: str) -> Colour:
+    fault = InputError(f"{entry}: expected a colour such as #2f62c9, found {_shown(value)}")
+    if not isinstance(value, str):
+        raise fault
     try:
         return parse_colour(value)
     except InputError:
-        raise InputError(f"{entry}: expected a colour such as #2f62c9, found {_shown(value)}") from None
+        raise fault from None
 
 
 def _boundary_colours(value: object) -> dict[str, Colour]:

@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import UInt8
 
 from capture4d.captures.description import LAST_FRAME
-from capture4d.errors import InputError
+from capture4d.errors import EmptyMeshError, InputError
 from capture4d.files.reading import one_line
+from capture4d.geometry.mesh import doubled_area_vectors
 from capture4d.geometry.point_clouds import faces_between
 from capture4d.geometry.seams import weld
 from capture4d.mesh_files.meshes import READABLE, read_coloured_mesh
@@ -28,6 +29,8 @@ KINDS = (".ply", ".glb", ".gltf", ".obj", ".off", ".stl")
 """Of several files with one number the first kind counts, and there the first name."""
 COMPANIONS = (".mtl", ".bin", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".tga")
 """What may lie beside the scans or in folders below, and belongs to them: materials, buffers, textures."""
+LARGEST = 1e9
+"""A thousand kilometres in millimetres: a float32 there knows no person any more."""
 _DIGITS = re.compile("[0-9]+")
 
 
@@ -157,9 +160,19 @@ def read_surface(path: Path) -> Surface:
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror or one_line(error)})", where=path) from error
     try:
+        _require_extent(found.mesh)
         return whole_surface(found.mesh, found.colours)
     except InputError as error:
         raise error.at(path) from None
+
+
+def _require_extent(mesh: Mesh) -> None:
+    """See that there is a surface of any size, in numbers that can be reckoned with."""
+    largest = float(np.abs(mesh.vertices).max(initial=0.0))
+    if largest > LARGEST:
+        raise InputError(f"expected coordinates up to {LARGEST:g}, found {largest:.3g}")
+    if len(mesh.faces) and not np.any(doubled_area_vectors(mesh.vertices.astype(np.float64), mesh.faces)):
+        raise EmptyMeshError("expected a surface, found all faces without area")
 
 
 def whole_surface(mesh: Mesh, colours: UInt8[np.ndarray, "verts 3"] | None) -> Surface:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -31,9 +30,11 @@ from capture4d.runs.workers import run_jobs
 from capture4d.settings import Count, settings
 from capture4d.types import GarmentScan
 
-__all__ = ["ExtractionResult", "ExtractionSettings", "flagged_frames", "run"]
+__all__ = ["CLOUDS", "ExtractionSettings", "estimated_frames", "flagged_frames", "run"]
 
 SCHEMA = 4
+CLOUDS = "clouds.json"
+"""Names the frames whose scans are points alone, so that normals and faces are estimated; not there without any."""
 LOOKED_AT = 4
 """Frames that can be read, of which one must have the garment and its paints: the first may be a bad one."""
 
@@ -47,17 +48,9 @@ class ExtractionSettings:
     """Learn all colours from the scans, not only those that capture.json leaves open."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ExtractionResult(StageResult):
-    """Garments that were cut out."""
-
-    estimated: tuple[int, ...] = ()
-    """Frames whose scans are points alone, so that normals and faces are estimated."""
-
-
 def run(
     capture: Capture, output: Path, config: ExtractionSettings, *, workers: int = 1, overwrite: bool = False
-) -> ExtractionResult:
+) -> StageResult:
     """Extract the garment of every frame that has none yet.
 
     Raises:
@@ -88,15 +81,21 @@ def run(
         for _ in run_jobs(partial(write_frame, capture, colours), jobs, workers=workers, label="extract garment"):
             pass
     frames = [stage.frame_path(frame_id) for frame_id in capture.frame_ids]
-    result = stage.finish(
+    if pending:
+        _say_estimated(output / CLOUDS, estimated_frames(output, capture.frame_ids))
+    return stage.finish(
         [colours_path, *frames],
         changed=bool(pending),
         frames=len(capture.frame_ids),
         failed=flagged_frames(output, capture.frame_ids),
     )
-    return ExtractionResult(
-        result.path, result.digest, result.frames, result.failed, estimated=estimated_frames(output, capture.frame_ids)
-    )
+
+
+def _say_estimated(path: Path, frame_ids: tuple[int, ...]) -> None:
+    if frame_ids:
+        write_json(path, {"frames": frame_ids})
+    else:
+        path.unlink(missing_ok=True)
 
 
 def flagged_frames(folder: Path, frame_ids: Sequence[int]) -> dict[int, str]:

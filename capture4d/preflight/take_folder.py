@@ -22,7 +22,6 @@ from capture4d.colours.spaces import Colour, parse_colour
 from capture4d.errors import EmptyMeshError, InputError, NotFiniteError
 from capture4d.files.atomic import read_json
 from capture4d.files.records import load_body, load_poses, load_rig
-from capture4d.geometry.mesh import doubled_area_vectors
 from capture4d.mesh_files.meshes import READABLE
 from capture4d.preflight.facts import BadFrame, Paints, TakeFacts
 from capture4d.types import PoseSequence, Rig
@@ -151,7 +150,7 @@ def read_frame(path: Path, frame_id: int) -> Surface | BadFrame:
     try:
         if path.stat().st_size == 0:
             return BadFrame(frame_id, "frame-empty", f"{path}: an empty file")
-        found = read_surface(path)
+        return read_surface(path)
     except EmptyMeshError as error:
         return BadFrame(frame_id, "frame-empty", str(error))
     except NotFiniteError as error:
@@ -160,9 +159,6 @@ def read_frame(path: Path, frame_id: int) -> Surface | BadFrame:
         return BadFrame(frame_id, "frame-unreadable", str(error))
     except OSError as error:  # it was there when the folder was listed
         return BadFrame(frame_id, "frame-unreadable", f"{path}: {error.strerror}")
-    if not np.any(doubled_area_vectors(found.mesh.vertices, found.mesh.faces)):
-        return BadFrame(frame_id, "frame-empty", f"{path}: all faces are without area")
-    return found
 
 
 def time_stamp(path: Path) -> float | None:
