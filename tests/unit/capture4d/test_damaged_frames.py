@@ -243,3 +243,22 @@ def test_textures_and_seams_of_sound_frames_are_read(sound: Path, tmp_path: Path
     assert len(scan.mesh.vertices) == len(found.mesh.vertices)
     assert len(boundary_loops(scan.mesh.faces)) == 2
     assert pipeline.extract(folder, tmp_path / "work").failed == {}
+
+
+def test_clouds_among_meshes_are_told_and_registered(sound: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    folder = tmp_path / "capture"
+    shutil.copytree(sound, folder)
+    for frame_id in (BAD, 5):
+        path = folder / "scans" / f"{frame_id:06d}.ply"
+        found = read_coloured_mesh(path)
+        write_mesh(path, Mesh(found.mesh.vertices, found.mesh.faces[:0]), colours=found.colours)
+    with pytest.raises(SystemExit):
+        main(["extract", str(folder), "--output", str(tmp_path / "work"), "--workers", "1"])
+    assert "2 scans are points without faces; normals and faces are estimated" in capsys.readouterr().err
+    assert json.loads((tmp_path / "work" / "garment" / "clouds.json").read_text()) == {"frames": [BAD, 5]}
+    assert pipeline.register(folder, tmp_path / "work", QUICK).failed == {}
+    records = {record["frame_id"]: record for record in open_work(tmp_path / "work").records}
+    meshed = np.mean([records[frame_id]["fit_mean_mm"] for frame_id in (2, 4)])
+    assert records[BAD]["fit_mean_mm"] < 1.15 * meshed + 0.05
+    (finding,) = [each for each in pipeline.check(folder).verdict.findings if each.code == "faces-missing"]
+    assert (finding.frames, finding.severity) == ((BAD, 5), "warning")

@@ -145,7 +145,7 @@ def split_at_seams(mesh: Mesh) -> Mesh:
     return Mesh(mesh.vertices[keys // 4], corners.reshape(-1, 3).astype(np.int32))
 
 
-@pytest.mark.parametrize("kind", ["ply", "obj", "glb", "off", "stl"])
+@pytest.mark.parametrize("kind", ["ply", "obj", "glb"])
 def test_seams_of_a_template_stay_closed_bit_for_bit(kind: str, garment, scan_of, quick, tmp_path: Path) -> None:
     import trimesh
 
