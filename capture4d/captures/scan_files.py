@@ -29,8 +29,9 @@ KINDS = (".ply", ".glb", ".gltf", ".obj", ".off", ".stl")
 """Of several files with one number the first kind counts, and there the first name."""
 COMPANIONS = (".mtl", ".bin", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".tga")
 """What may lie beside the scans or in folders below, and belongs to them: materials, buffers, textures."""
-LARGEST = 1e9
-"""A thousand kilometres in millimetres: a float32 there knows no person any more."""
+LARGEST, SMALLEST = 1e9, 1e-4
+"""Coordinates, and extents: a thousand kilometres in millimetres, where a float32 knows no person any more, and a tenth
+of a millimetre in metres."""
 _DIGITS = re.compile("[0-9]+")
 
 
@@ -171,6 +172,9 @@ def _require_extent(mesh: Mesh) -> None:
     largest = float(np.abs(mesh.vertices).max(initial=0.0))
     if largest > LARGEST:
         raise InputError(f"expected coordinates up to {LARGEST:g}, found {largest:.3g}")
+    size = float(np.ptp(mesh.vertices.astype(np.float64), axis=0).max()) if len(mesh.vertices) else 0.0
+    if size < SMALLEST:
+        raise EmptyMeshError(f"expected a surface, found {len(mesh.vertices)} vertices within {size:.3g}")
     if len(mesh.faces) and not np.any(doubled_area_vectors(mesh.vertices.astype(np.float64), mesh.faces)):
         raise EmptyMeshError("expected a surface, found all faces without area")
 

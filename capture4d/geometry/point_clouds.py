@@ -32,7 +32,7 @@ sphere whose points are off by a quarter of their distance a quarter is left out
 BALL_RADII = (1.0, 1.5)
 """Of the ball, in spacings, one after the other."""
 UNEVEN = 1e-3
-"""Points of an even grid are moved by so many spacings before the ball rolls: it stops where it touches four at once."""
+"""Points are moved by so many spacings before the ball rolls: on an even grid it touches four at once, and stops."""
 _AT_ONCE = 100_000
 
 
@@ -48,10 +48,10 @@ def faces_between(points: Float[np.ndarray, "V 3"]) -> Int32[np.ndarray, "F 3"]:
             f"expected a mesh, or a cloud of at least {LEAST_POINTS} points; found no faces, and {len(places)} points"
         )
     places = places.astype(np.float64)
-    reach = KDTree(places).query(places, k=[SPACING_NEIGHBOUR + 1])[0]
+    reach = KDTree(places).query(places, k=SPACING_NEIGHBOUR + 1)[0][:, -1]
     spacing = float(np.median(reach))
     size = float(np.linalg.norm(np.ptp(places, axis=0)))
-    if not spacing > 1e-6 * size:
+    if not spacing > 1e-9 * size:
         raise InputError(f"expected the points of a surface, found most of {len(places)} in one place")
     places = (places - places.mean(axis=0)) / spacing
     geometry, utility = import_open3d().geometry, import_open3d().utility

@@ -72,8 +72,8 @@ WRONG = [
     ('{"a": %s}' % ("[" * 100_000), "not valid JSON"),
     ("\ufeffnull", "not valid JSON"),
 ]  # fmt: skip
-LEADING = ("../x", "a/b", "/etc/x", "C:\\x", "a\\b", "x\0y", "nul", "CON", "com1.txt", "a:b", "..", ".", ".hidden", "x.",
-           " x", "x ", "", "a\nb", "a\x1bb", "?", "*", "\u2028", "x" * 300)  # fmt: skip
+LEADING = ("../x", "a/b", "/etc/x", "C:\\x", "a\\b", "x\0y", "nul", "CON", "com1.txt", "a:b", "..", ".", ".hidden",
+           "x.", " x", "x ", "", "a\nb", "a\x1bb", "?", "*", "\u2028", "x" * 300)  # fmt: skip
 
 
 @pytest.mark.parametrize(("text", "said"), WRONG)
