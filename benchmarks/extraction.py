@@ -29,7 +29,7 @@ from capture4d.colours.learning import ColoursNotSeparableError, learn_colours
 from capture4d.evaluation import curve_distances
 from capture4d.extraction.garment import ColourNotFoundError, cut_out
 from capture4d.files.records import load_poses
-from capture4d.geometry.closest_points import surface_distances
+from capture4d.geometry.ray_casting import surface_distances
 from capture4d.types import GarmentScan, Mesh, Scan
 from data_synth.config import PRESETS
 from data_synth.outfits import OUTFITS, OutfitName

@@ -36,7 +36,7 @@ from capture4d.evaluation import border_errors, correspondence_errors, drift_rat
 from capture4d.extraction.stage import ExtractionSettings
 from capture4d.extraction.stage import run as extract
 from capture4d.files.atomic import read_json
-from capture4d.geometry.closest_points import surface_distances
+from capture4d.geometry.ray_casting import surface_distances
 from capture4d.mesh_files.meshes import read_mesh
 from capture4d.types import Garment, GarmentScan, Mesh
 from registration.config import PAPER, MeshRegistrationConfig, RegistrationConfig

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial import KDTree
 
-from capture4d.geometry.closest_points import closest_points
 from capture4d.geometry.mesh import face_areas, vertex_normals
+from capture4d.geometry.ray_casting import closest_points
 from capture4d.types import Mesh
 
 __all__ = ["ScanErrors", "scan_errors"]

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32, Integer
 
-from capture4d.geometry.closest_points import surface_distances
+from capture4d.geometry.ray_casting import surface_distances
 from capture4d.types import Mesh
 
 __all__ = [

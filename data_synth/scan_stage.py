@@ -20,8 +20,8 @@ from capture4d.colours.spaces import parse_colour
 from capture4d.errors import InputError
 from capture4d.files.atomic import file_digest
 from capture4d.files.records import load_rig, save_garment, save_rig
-from capture4d.geometry.closest_points import closest_points
 from capture4d.geometry.mesh import boundary_loops
+from capture4d.geometry.ray_casting import closest_points
 from capture4d.heavy_imports import import_open3d
 from capture4d.mesh_files.meshes import read_mesh
 from capture4d.runs.stage import Stage, StageResult, open_stage

@@ -1,5 +1,8 @@
 """Any template onto any scan: two mesh files in, the deformed template and its measures out.
 
+A template that its file splits at UV seams is joined there while it is registered, and comes back vertex for vertex:
+what lay in one place lies in one place.
+
 Everything is brought to one size before anything is decided by a length: the template's bounding box gets the diagonal
 of a shirt, for which the constants are made. Units therefore change the numbers of the report and nothing else.
 """
@@ -8,16 +11,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32, Float64
 
+from capture4d.captures.scan_files import whole_surface
 from capture4d.colours.spaces import parse_colour
 from capture4d.errors import InputError
 from capture4d.files.atomic import nan_to_none, write_json
 from capture4d.geometry.mesh import boundary_loops, submesh
+from capture4d.geometry.seams import weld
 from capture4d.mesh_files.meshes import WRITABLE, read_mesh, write_mesh
 from capture4d.types import Garment, GarmentScan, Mesh
 from capture4d.units import METRES, Units
@@ -43,11 +48,13 @@ class MeshRegistration:
     """A registered mesh."""
 
     vertices: Float32[np.ndarray, "verts 3"]
-    """In the template's order and the files' unit."""
+    """In the template's order and the files' unit; vertices that a seam splits stay in one place, bit for bit."""
     start: Float64[np.ndarray, "verts 3"]
     """The template after pre-alignment, in the files' unit."""
     quality: FrameQuality
     """Judged on the normalised problem; all its lengths, those in `reasons` too, are of the files' world."""
+    estimated: bool = False
+    """The scan came as points alone; its faces are made between them."""
 
 
 def run(
@@ -71,7 +78,7 @@ def run(
         raise InputError(
             f"expected a mesh file ({', '.join(WRITABLE)}), found '{output_path.suffix}'", where=output_path
         )
-    template_file, scan_file = read_mesh(template_path), read_mesh(scan_path)
+    template_file, scan_file = read_mesh(template_path), read_mesh(scan_path, faces_needed=False)
     result = register_mesh(
         template_file.mesh,
         scan_file.mesh,
@@ -91,6 +98,7 @@ def run(
             "template": str(template_path),
             "scan": str(scan_path),
             "units": units,
+            "scan_faces": "estimated" if result.estimated else "given",
             "verdict": result.quality.verdict,
             "reasons": list(result.quality.reasons),
             **numbers,
@@ -113,18 +121,27 @@ def register_mesh(
     """Deform a template onto a scan; both in one unit, of any kind.
 
     Args:
+        scan: may have no faces; they are made between its points then.
         colours: (S, 3) uint8 of the scan's vertices, needed for `config.boundary_colour`.
         template_name, scan_name: how errors call them.
     """
+    split = weld(template.vertices, template.faces)
+    template = Mesh(template.vertices[split.first], split.faces)
     size = _diagonal(template.vertices)
     _require_one_unit(size, _diagonal(scan.vertices), template_name, scan_name)
+    try:
+        surface = whole_surface(scan, colours)
+    except InputError as error:
+        raise error.at(scan_name) from None
     scale, origin = DIAGONAL / size, template.vertices.astype(np.float64).mean(axis=0)
 
     def normalised(points: np.ndarray) -> np.ndarray:
         return scale * (points.astype(np.float64) - origin)
 
     start = normalised(template.vertices)
-    garment_scan = _garment_scan(scan, normalised(scan.vertices), colours, find_border, config, scan_name)
+    garment_scan = _garment_scan(
+        surface.mesh, normalised(surface.mesh.vertices), surface.colours, find_border, config, scan_name
+    )
     if config.align != "none":
         motion: Similarity = align(
             start, garment_scan.mesh.vertices.astype(np.float64), with_scale=config.align == "similarity"
@@ -140,9 +157,21 @@ def register_mesh(
     metres = METRES[config.units if config.units != "auto" else guess_units(template)]
     quality = assess(analysis, frame, fitted.vertices, config.registration.quality, length_factor=metres / scale)
     return MeshRegistration(
-        vertices=(fitted.vertices / scale + origin).astype(np.float32),
-        start=start / scale + origin,
-        quality=quality,
+        vertices=(fitted.vertices / scale + origin).astype(np.float32)[split.of_vertex],
+        start=(start / scale + origin)[split.of_vertex],
+        quality=_at_vertices(quality, split.of_vertex),
+        estimated=surface.estimated,
+    )
+
+
+def _at_vertices(quality: FrameQuality, of_vertex: np.ndarray) -> FrameQuality:
+    """What is known of each welded vertex, for all that it stands for."""
+    return replace(
+        quality,
+        residual_m=quality.residual_m[of_vertex],
+        border_error_m=quality.border_error_m[of_vertex],
+        stretch=quality.stretch[of_vertex],
+        flipped=quality.flipped[of_vertex],
     )
 
 

@@ -2,7 +2,7 @@
 
     CAPTURE/
       capture.json                    name, frame rate, paint colours
-      scans/000123.ply                one coloured mesh per frame (ply, glb or obj)
+      scans/000123.ply                one coloured mesh per frame (ply, glb, gltf or obj)
       poses.npz body.npz              motion capture and the body it moves            [optional]
       template.npz or template.obj    garment to register                             [optional]
       rig.json                        cameras                                         [optional]
@@ -13,20 +13,25 @@ docs/reference/files.md describes every file, so that it can be written without 
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 
 from capture4d.body.anny import load_anny
-from capture4d.colours.spaces import Colour, format_colour, parse_colour
+from capture4d.captures.description import FORMAT, LAST_FRAME, parse_description
+from capture4d.captures.names import require_plain_names
+from capture4d.captures.scan_files import KINDS, list_scans, read_surface
+from capture4d.colours.spaces import Colour, format_colour
 from capture4d.errors import InputError
 from capture4d.files.atomic import content_digest, file_digest, parse_json, write_json
-from capture4d.files.reading import one_line, shortened
+from capture4d.files.reading import shortened
 from capture4d.files.records import (
     load_body,
     load_garment,
@@ -34,7 +39,8 @@ from capture4d.files.records import (
     load_rig,
 )
 from capture4d.geometry.mesh import boundary_loops
-from capture4d.mesh_files.meshes import READABLE, read_coloured_mesh, read_mesh, write_mesh
+from capture4d.geometry.seams import welded_mesh
+from capture4d.mesh_files.meshes import READABLE, read_mesh, write_mesh
 from capture4d.types import Body, Garment, PoseSequence, Rig, Scan
 from capture4d.units import METRES, Units
 
@@ -43,6 +49,7 @@ __all__ = [
     "CaptureFiles",
     "capture_digest",
     "read_capture",
+    "read_frame",
     "read_scan",
     "scan_digest",
     "scan_path",
@@ -50,15 +57,6 @@ __all__ = [
     "write_capture_description",
     "write_scan",
 ]
-
-_FORMAT = 1
-
-
-TEXTURE_SUFFIXES = (".mtl", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
-"""What may lie beside the scans and colour them."""
-
-
-SCAN_SUFFIXES = (".ply", ".glb", ".obj")
 
 _END = 65_536
 
@@ -71,8 +69,8 @@ class CaptureFiles:
     """Of capture.json."""
     scans: Mapping[int, Path]
     """By frame number."""
-    textures: tuple[Path, ...]
-    """Beside the scans, by name."""
+    companions: tuple[Path, ...]
+    """Textures and what else belongs to the scans, in their folder and those below it, by name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,10 +99,12 @@ class Capture:
     def __post_init__(self) -> None:
         if not self.frame_ids:
             raise InputError("expected at least one frame, found none", where=self.path)
-        if not self.fps > 0:
+        if not 0 < self.fps < math.inf:
             raise InputError(f"expected a positive frame rate, found {self.fps}", where=self.path)
         if list(self.frame_ids) != sorted(set(self.frame_ids)) or self.frame_ids[0] < 0:
             raise InputError("expected ascending frame numbers, each once and none negative", where=self.path)
+        if self.frame_ids[-1] > LAST_FRAME:
+            raise InputError(f"expected frame numbers up to {LAST_FRAME}, found {self.frame_ids[-1]}", where=self.path)
 
     def __getstate__(self) -> dict[str, Any]:
         """What travels to another process: not what was read of the folder, which is read there if it is needed."""
@@ -121,15 +121,19 @@ class Capture:
 
     @cached_property
     def template(self) -> Garment:
-        """The garment to register: `template.npz`, or a bare mesh `template.obj` with loops called border_0, ...
+        """The garment to register: `template.npz`, or a bare mesh with loops called border_0, ...
+
+        The bare mesh of a format that splits vertices at seams is joined there.
 
         Raises:
-            InputError: there is neither.
+            InputError: there is neither, or it is damaged.
         """
-        path, data = self._template_file
-        if path.suffix == ".npz":
-            return load_garment(path, data)
-        mesh = read_mesh(path).mesh
+        path = self._template_path
+        if path.suffix.lower() == ".npz":
+            garment = load_garment(path, self._template_files[path.name])
+            _require_loop_names(garment, path)
+            return garment
+        mesh, _ = welded_mesh(read_mesh(path).mesh)
         if self.units != "m":
             mesh = mesh.with_vertices(mesh.vertices * np.float32(METRES[self.units]))
         return Garment(mesh, {f"border_{index}": loop for index, loop in enumerate(boundary_loops(mesh.faces))})
@@ -137,13 +141,18 @@ class Capture:
     @property
     def template_digest(self) -> str:
         """Raises InputError where there is no template."""
-        path, data = self._template_file
-        return content_digest({path.name: data})
+        return content_digest(self._template_files)
 
     @cached_property
-    def _template_file(self) -> tuple[Path, bytes]:
-        path = template_path(self)
-        return path, path.read_bytes()
+    def _template_path(self) -> Path:
+        return template_path(self)
+
+    @cached_property
+    def _template_files(self) -> dict[str, bytes]:
+        """The template, and the buffers that a gltf has in files of their own, by name."""
+        path = self._template_path
+        beside = sorted(path.parent.glob("*.[bB][iI][nN]")) if path.suffix.lower() == ".gltf" else []
+        return {file.name: file.read_bytes() for file in (path, *beside)}
 
     @cached_property
     def poses(self) -> PoseSequence | None:
@@ -192,17 +201,6 @@ class Capture:
 # --- description and scans ---------------------------------------------------------------------------------------
 
 
-def _optional_colour(text: str | None) -> Colour | None:
-    return None if text is None else parse_colour(text)
-
-
-def _parse_units(text: str) -> Units:
-    for units in get_args(Units):
-        if text == units:
-            return units
-    raise InputError(f"expected units {', '.join(get_args(Units))}, found '{text}'")
-
-
 def read_capture(path: str | Path, *, scans: bool = True) -> Capture:
     """Read `capture.json`, and see that every frame it names has a scan.
 
@@ -220,24 +218,29 @@ def read_capture(path: str | Path, *, scans: bool = True) -> Capture:
     files = _list_files(path)
     found = parse_json(files.description, description)
     try:
-        if found.get("format") != _FORMAT:
-            raise InputError(f"expected format {_FORMAT}, found {found.get('format')}")
-        capture = Capture(
-            path=path,
-            name=str(found.get("name", path.resolve().name)),
-            fps=float(found["fps"]),
-            frame_ids=tuple(int(frame_id) for frame_id in found.get("frames") or sorted(files.scans)),
-            garment_colour=_optional_colour(found.get("garment_colour")),
-            boundary_colours={name: parse_colour(text) for name, text in found.get("boundary_colours", {}).items()},
-            units=_parse_units(found.get("units", "m")),
-            files=files,
-        )
+        said = parse_description(found)
+        for entry in ("format", "fps"):
+            if found.get(entry) is None:
+                raise InputError(f"expected the entry '{entry}', found none")
     except InputError as error:
         raise InputError(shortened(error.reason), where=description) from None
-    except KeyError as error:
-        raise InputError(f"expected the entry {error}, found none", where=description) from None
-    except (AttributeError, OverflowError, TypeError, ValueError) as error:
-        raise InputError(one_line(error), where=description) from None
+    assert said.fps is not None
+    frame_ids = tuple(files.scans) if said.frames is None else said.frames
+    if not frame_ids:
+        kinds = ", ".join(KINDS)
+        raise InputError(
+            f"expected scans with a frame number in their names ({kinds}), found none", where=path / "scans"
+        )
+    capture = Capture(
+        path=path,
+        name=said.name or path.resolve().name,
+        fps=said.fps,
+        frame_ids=frame_ids,
+        garment_colour=said.garment_colour,
+        boundary_colours=said.boundary_colours,
+        units=said.units,
+        files=files,
+    )
     missing = [frame_id for frame_id in capture.frame_ids if frame_id not in files.scans]
     if scans and missing:
         raise InputError(
@@ -248,14 +251,8 @@ def read_capture(path: str | Path, *, scans: bool = True) -> Capture:
 
 
 def _list_files(path: Path) -> CaptureFiles:
-    folder = path / "scans"
-    entries = sorted(folder.iterdir()) if folder.is_dir() else []
-    scans: dict[int, Path] = {}
-    for suffix in SCAN_SUFFIXES[::-1]:  # of several files of a frame the first kind counts, and there the first name
-        found = (entry for entry in entries[::-1] if entry.suffix == suffix and entry.stem.isdecimal())
-        scans |= {int(entry.stem): entry for entry in found}
-    textures = tuple(entry for entry in entries if entry.suffix.lower() in TEXTURE_SUFFIXES)
-    return CaptureFiles((path / "capture.json").read_bytes(), scans, textures)
+    found = list_scans(path / "scans")
+    return CaptureFiles((path / "capture.json").read_bytes(), found.scans, found.companions)
 
 
 def _expected_scan(path: Path, frame_id: int) -> Path:
@@ -267,7 +264,7 @@ def write_capture_description(capture: Capture) -> None:
     write_json(
         capture.path / "capture.json",
         {
-            "format": _FORMAT,
+            "format": FORMAT,
             "name": capture.name,
             "fps": capture.fps,
             "units": capture.units,
@@ -287,27 +284,33 @@ def scan_path(capture: Capture, frame_id: int) -> Path:
     if capture.files is not None:
         found = capture.files.scans.get(frame_id)
     else:
-        named = (capture.path / "scans" / f"{frame_id:06d}{suffix}" for suffix in SCAN_SUFFIXES)
+        named = (capture.path / "scans" / f"{frame_id:06d}{suffix}" for suffix in KINDS)
         found = next((path for path in named if path.is_file()), None)
+        found = found or list_scans(capture.path / "scans", companions_below=False).scans.get(frame_id)
     if found is None:
         raise InputError("no such scan", where=_expected_scan(capture.path, frame_id))
     return found
 
 
 def read_scan(capture: Capture, frame_id: int) -> Scan:
-    """Read one frame, in metres.
+    """Read one frame, in metres: joined along the seams of its texture, and with faces where the file has points alone.
 
     Raises:
         InputError: the scan is missing, damaged, or has neither vertex colours nor a texture.
     """
+    return read_frame(capture, frame_id)[0]
+
+
+def read_frame(capture: Capture, frame_id: int) -> tuple[Scan, bool]:
+    """`read_scan`, and whether its faces are estimated."""
     path = scan_path(capture, frame_id)
-    found = read_coloured_mesh(path)
+    found = read_surface(path)
     if found.colours is None:
         raise InputError("expected a colour per vertex, found none, nor a texture", where=path)
     mesh = found.mesh
     if capture.units != "m":
         mesh = mesh.with_vertices(mesh.vertices * np.float32(METRES[capture.units]))
-    return Scan(mesh, found.colours, frame_id, capture.time_s(frame_id))
+    return Scan(mesh, found.colours, frame_id, capture.time_s(frame_id)), found.estimated
 
 
 def write_scan(path: str | Path, scan: Scan) -> None:
@@ -325,18 +328,23 @@ def capture_digest(capture: Capture, *, instead: Mapping[int, str] | None = None
     for frame_id in capture.frame_ids:
         digest = (instead or {}).get(frame_id) or scan_digest(scan_path(capture, frame_id))
         total.update(f"{frame_id} {digest}\n".encode())
-    for path in files.textures:
-        total.update(f"{path.name} {scan_digest(path)}\n".encode())
+    for path in files.companions:
+        name = path.relative_to(capture.path / "scans").as_posix()
+        total.update(f"{name} {scan_digest(path)}\n".encode("utf-8", "surrogateescape"))
     return total.hexdigest()
 
 
 def scan_digest(path: Path) -> str:
-    """Digest of a scan or its texture: name, size, first and last 64 kB, for takes are too large to be read twice."""
+    """Digest of a scan or its texture: name, size, first and last 64 kB, for takes are too large to be read twice.
+
+    Of a file that cannot be opened, name and size alone: that is a fault of its frame, not of the take.
+    """
     size = path.stat().st_size
-    with path.open("rb") as file:
-        total = hashlib.sha256(f"{path.name} {size}\n".encode() + file.read(_END))
+    total = hashlib.sha256(f"{path.name} {size}\n".encode("utf-8", "surrogateescape"))
+    with contextlib.suppress(OSError), path.open("rb") as file:
+        ends = file.read(_END)
         file.seek(max(size - _END, _END))
-        total.update(file.read(_END))
+        total.update(ends + file.read(_END))
     return total.hexdigest()
 
 
@@ -366,15 +374,24 @@ def _poses(capture: Capture) -> PoseSequence | None:
 
 
 def template_path(capture: Capture) -> Path:
-    """The file of the template.
+    """The file of the template, in any letter case of its ending; an npz before bare meshes.
 
     Raises:
         InputError: there is none.
     """
-    for suffix in (".npz", *READABLE):
-        path = capture.path / f"template{suffix}"
-        if path.is_file():
-            return path
-    raise InputError(
-        "no such file, nor a template.obj; registration needs a template", where=capture.path / "template.npz"
-    )
+    kinds = (".npz", *READABLE)
+    found = [
+        path for path in sorted(capture.path.glob("template.*")) if path.suffix.lower() in kinds and path.is_file()
+    ]
+    if not found:
+        raise InputError(
+            "no such file, nor a template.obj; registration needs a template", where=capture.path / "template.npz"
+        )
+    return min(found, key=lambda path: kinds.index(path.suffix.lower()))
+
+
+def _require_loop_names(garment: Garment, path: Path) -> None:
+    try:
+        require_plain_names(garment.loops, "border")
+    except InputError as error:
+        raise error.at(path) from None

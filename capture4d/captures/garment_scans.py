@@ -11,11 +11,19 @@ from capture4d.files.arrays import ArrayFile
 from capture4d.files.atomic import write_npz
 from capture4d.types import GarmentScan, Mesh
 
-__all__ = ["load_garment_scan", "save_garment_scan"]
+__all__ = ["ESTIMATED", "load_garment_scan", "save_garment_scan"]
 
 
-def save_garment_scan(path: Path, scan: GarmentScan) -> None:
-    """Write one garment scan as npz, atomically."""
+ESTIMATED = "faces_estimated"
+"""An array that a garment has whose scan is points alone."""
+
+
+def save_garment_scan(path: Path, scan: GarmentScan, *, estimated: bool = False) -> None:
+    """Write one garment scan as npz, atomically.
+
+    Args:
+        estimated: the scan is points alone, and its faces are estimated; the file says so.
+    """
     write_npz(
         path,
         vertices=scan.mesh.vertices,
@@ -23,6 +31,7 @@ def save_garment_scan(path: Path, scan: GarmentScan) -> None:
         boundary_points=scan.boundary_points,
         boundary_loops=scan.boundary_loops,
         loop_names=np.array(scan.loop_names, dtype=np.str_),
+        **({ESTIMATED: np.array(True)} if estimated else {}),
     )
 
 

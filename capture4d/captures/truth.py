@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float32, Int32, UInt8
 
 from capture4d.captures.capture import Capture
+from capture4d.errors import InputError
 from capture4d.files.arrays import ArrayFile, mesh_arrays
 from capture4d.files.atomic import write_npz
 from capture4d.types import Mesh
@@ -89,9 +90,23 @@ def read_truth_frame(capture: Capture, frame_id: int) -> TruthFrame:
         return TruthFrame(arrays["vertices"], arrays["rotations"], arrays["translation"], arrays["labels"])
 
 
-def read_truth_vertices(capture: Capture, frame_id: int) -> Float32[np.ndarray, "fine 3"]:
-    with ArrayFile(_truth_path(capture, frame_id)) as arrays:
-        return arrays["vertices"]
+def read_truth_vertices(
+    capture: Capture, frame_id: int, *, model: TruthModel | None = None
+) -> Float32[np.ndarray, "fine 3"]:
+    """Vertices of the simulated garment in a frame.
+
+    Args:
+        model: that it is a state of; one of other vertices is a fault of the frame.
+    """
+    path = _truth_path(capture, frame_id)
+    with ArrayFile(path) as arrays:
+        vertices = arrays["vertices"]
+    expected = len(vertices) if model is None else len(model.fine.vertices)
+    if vertices.shape != (expected, 3) or vertices.dtype != np.float32 or not np.isfinite(vertices).all():
+        raise InputError(
+            f"expected {expected} finite float32 vertices, found {vertices.dtype} of {vertices.shape}", where=path
+        )
+    return vertices
 
 
 def _truth_path(capture: Capture, frame_id: int) -> Path:

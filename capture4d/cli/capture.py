@@ -24,7 +24,7 @@ class Check:
     capture: Annotated[Positional[Path], arg(metavar="CAPTURE")]
     """Capture folder, or just a folder of scans."""
     frames: str | None = None
-    """How scans are named, such as "take_{frame}.ply"; else the last number in a name is the frame's."""
+    """How scans are named, such as "take_{frame}.ply"; else the last number in a name that differs is the frame's."""
     fps: Positive | None = None
     """Frame rate, if capture.json does not say, or is to be doubted."""
     units: Literal["m", "cm", "mm", "in"] | None = None

@@ -67,7 +67,7 @@ class RegisterMesh:
     template: Annotated[Positional[Path], arg(metavar="TEMPLATE")]
     """Mesh to deform: obj, ply, glb, gltf, stl or off. Its vertex order and faces are kept."""
     scan: Annotated[Positional[Path], arg(metavar="SCAN")]
-    """Mesh to fit it to: obj, ply, glb, gltf, stl or off."""
+    """Mesh to fit it to: obj, ply, glb, gltf, stl or off; a point cloud gets faces between its points."""
     output: Path
     """Mesh to write: ply, obj, glb or off; the JSON has the same name."""
     config: Annotated[MeshRegistrationConfig, arg(name="")] = field(default_factory=MeshRegistrationConfig)
@@ -77,6 +77,8 @@ class RegisterMesh:
 
         result = pipeline.register_mesh(self.template, self.scan, self.output, self.config)
         print(f"registered: {self.output}, measures: {self.output.with_suffix('.json')}")
+        if result.estimated:
+            print(f"capture4d: {self.scan}: points without faces; normals and faces are estimated", file=sys.stderr)
         quality = result.quality
         if quality.verdict != "good":
             print(f"capture4d: {self.output}: {quality.verdict}: {'; '.join(quality.reasons)}", file=sys.stderr)

@@ -43,6 +43,7 @@ class Extract(StageOptions):
             frame_id, reason = next(iter(result.failed.items()))
             print(f"capture4d: no garment in {len(result.failed)} frames, first in {frame_id}: {reason}",
                   file=sys.stderr)  # fmt: skip
+        _say_clouds(self.output)
         print(f"garment: {result.path}")
         return GOOD
 
@@ -124,8 +125,20 @@ class Run(GradedOptions):
             workers=self.workers,
             overwrite=self.overwrite,
         )
+        _say_clouds(self.output)
         print(f"report: {result.path}")
         return self.graded(result)
+
+
+def _say_clouds(work: Path) -> None:
+    """Tell of scans that are points alone, as extraction has noted."""
+    from capture4d.extraction.stage import CLOUDS
+    from capture4d.files.atomic import read_json
+
+    path = work / "garment" / CLOUDS
+    if path.is_file():
+        count = len(read_json(path)["frames"])
+        print(f"capture4d: {count} scans are points without faces; normals and faces are estimated", file=sys.stderr)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,10 +1,10 @@
 """The stage that cuts the garment out of every scan: CAPTURE in, WORK/garment out.
 
-Colours that capture.json does not give are learned from a few scans first, and written to colours.json. All must be in
-the first frame that can be read, or else capture.json is wrong. A later frame that lacks them, because the subject has
-left the volume or hides a border, and any frame whose scan is damaged, gets the reason instead of a garment, and
-registration flags it. Damaged scans are read again in every run, in case they were repaired; other scans must not have
-changed.
+Colours that capture.json does not give are learned from a few scans first, and written to colours.json. One of the
+first four frames that can be read must have all of them, or else capture.json is wrong. Any other frame that lacks
+them, because the subject has left the volume or hides a border, and any frame whose scan is damaged, gets the reason
+instead of a garment, and registration flags it. Damaged scans are read again in every run, in case they were repaired;
+other scans must not have changed.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from capture4d.captures.capture import Capture, capture_digest, read_scan, scan_digest, scan_path
-from capture4d.captures.garment_scans import save_garment_scan
+from capture4d.captures.capture import Capture, capture_digest, read_frame, scan_digest, scan_path
+from capture4d.captures.garment_scans import ESTIMATED, save_garment_scan
 from capture4d.captures.take_colours import KnownColours, take_colours, template_loops
 from capture4d.colours.spaces import format_colour
 from capture4d.errors import InputError
@@ -30,9 +30,13 @@ from capture4d.runs.workers import run_jobs
 from capture4d.settings import Count, settings
 from capture4d.types import GarmentScan
 
-__all__ = ["ExtractionSettings", "flagged_frames", "run"]
+__all__ = ["CLOUDS", "ExtractionSettings", "estimated_frames", "flagged_frames", "run"]
 
 SCHEMA = 4
+CLOUDS = "clouds.json"
+"""Names the frames whose scans are points alone, so that normals and faces are estimated; not there without any."""
+LOOKED_AT = 4
+"""Frames that can be read, of which one must have the garment and its paints: the first may be a bad one."""
 
 
 @settings
@@ -50,7 +54,7 @@ def run(
     """Extract the garment of every frame that has none yet.
 
     Raises:
-        InputError: a scan is missing, none can be read, or the first that can lacks the garment's colours; or these are
+        InputError: a scan is missing, none can be read, or the first that can lack the garment's colours; or these are
             to be learned and are not separable.
     """
     named = {}
@@ -77,6 +81,8 @@ def run(
         for _ in run_jobs(partial(write_frame, capture, colours), jobs, workers=workers, label="extract garment"):
             pass
     frames = [stage.frame_path(frame_id) for frame_id in capture.frame_ids]
+    if pending:
+        _say_estimated(output / CLOUDS, estimated_frames(output, capture.frame_ids))
     return stage.finish(
         [colours_path, *frames],
         changed=bool(pending),
@@ -85,10 +91,27 @@ def run(
     )
 
 
+def _say_estimated(path: Path, frame_ids: tuple[int, ...]) -> None:
+    if frame_ids:
+        write_json(path, {"frames": frame_ids})
+    else:
+        path.unlink(missing_ok=True)
+
+
 def flagged_frames(folder: Path, frame_ids: Sequence[int]) -> dict[int, str]:
     """Frames of an extraction without a garment, and why."""
     reasons = {frame_id: _reason(folder / "frames" / f"{frame_id:06d}.npz") for frame_id in frame_ids}
     return {frame_id: reason for frame_id, reason in reasons.items() if reason}
+
+
+def estimated_frames(folder: Path, frame_ids: Sequence[int]) -> tuple[int, ...]:
+    """Frames of an extraction whose scans are points alone."""
+    found = []
+    for frame_id in frame_ids:
+        with ArrayFile(folder / "frames" / f"{frame_id:06d}.npz") as arrays:
+            if ESTIMATED in arrays:
+                found.append(frame_id)
+    return tuple(found)
 
 
 def _unreadable_scans(folder: Path, frame_ids: Sequence[int]) -> dict[int, str]:
@@ -112,28 +135,35 @@ def _reason(path: Path) -> str:
 
 
 def _extract_first(capture: Capture, colours: KnownColours, stage: Stage, pending: Sequence[int]) -> int | None:
-    """Extract the first frame that can be read, if that is not done, to see that the colours are right.
+    """Extract the first frame that has the garment, if that is not done, to see that the colours are right.
 
     Returns:
         The frame; None if it was done before.
     Raises:
-        ColourNotFoundError: the garment or a paint is not in it.
+        ColourNotFoundError: the garment or a paint is in none of the first that can be read.
         InputError: no frame can be read; about the first.
     """
-    faults = []
+    absent: list[InputError] = []
+    damaged: list[InputError] = []
+    waiting = set(pending)
     for frame_id in capture.frame_ids:
-        if frame_id not in pending:
+        if frame_id not in waiting:
+            if _reason(stage.frame_path(frame_id)):
+                continue
             return None
         try:
-            found = extract_frame(capture, colours, frame_id)
-        except ColourNotFoundError:
-            raise
-        except InputError as error:
-            faults.append(error)
+            found, estimated = extract_frame(capture, colours, frame_id)
+        except ColourNotFoundError as error:
+            absent.append(error)
+            if len(absent) == LOOKED_AT:
+                break
             continue
-        save_garment_scan(stage.frame_path(frame_id), found)
+        except InputError as error:
+            damaged.append(error)
+            continue
+        save_garment_scan(stage.frame_path(frame_id), found, estimated=estimated)
         return frame_id
-    raise faults[0]
+    raise (absent or damaged)[0]
 
 
 def _described(colours: KnownColours) -> dict[str, Any]:
@@ -145,16 +175,18 @@ def _described(colours: KnownColours) -> dict[str, Any]:
     }
 
 
-def extract_frame(capture: Capture, colours: KnownColours, frame_id: int) -> GarmentScan:
-    """Read one scan and cut its garment out."""
-    return cut_out(read_scan(capture, frame_id), colours, source=str(scan_path(capture, frame_id)))
+def extract_frame(capture: Capture, colours: KnownColours, frame_id: int) -> tuple[GarmentScan, bool]:
+    """Read one scan and cut its garment out; and whether the scan's faces are estimated."""
+    scan, estimated = read_frame(capture, frame_id)
+    return cut_out(scan, colours, source=str(scan_path(capture, frame_id))), estimated
 
 
 def write_frame(capture: Capture, colours: KnownColours, job: tuple[int, Path]) -> None:
     """Extract one frame and write it, or the reason why there is nothing to write."""
     frame_id, path = job
     try:
-        save_garment_scan(path, extract_frame(capture, colours, frame_id))
+        found, estimated = extract_frame(capture, colours, frame_id)
+        save_garment_scan(path, found, estimated=estimated)
     except InputError as error:
         damaged = not isinstance(error, ColourNotFoundError)
         source = {"scan": np.array(scan_digest(scan_path(capture, frame_id)))} if damaged else {}

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int32, Integer
+from jaxtyping import Bool, Float, Float32, Float64, Int32, Integer
 
 from capture4d.heavy_imports import import_open3d
+from capture4d.types import Mesh
 
-__all__ = ["Hits", "Nearest", "TriangleScene", "barycentric"]
+__all__ = ["Hits", "Nearest", "TriangleScene", "barycentric", "closest_points", "surface_distances"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,6 +93,19 @@ class TriangleScene:
 def barycentric(uv: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "points 3"]:
     """All three coordinates from the second and third."""
     return np.column_stack([1 - uv.sum(axis=1), uv])
+
+
+def closest_points(
+    mesh: Mesh, points: Float[np.ndarray, "points 3"]
+) -> tuple[Float32[np.ndarray, "points 3"], Int32[np.ndarray, " points"], Float32[np.ndarray, "points 3"]]:
+    """The nearest point of a surface to each point: its position, face and barycentric coordinates. Exact."""
+    found = TriangleScene((mesh.vertices, mesh.faces), threads=0).nearest(points)
+    return found.points, found.faces, barycentric(found.uv)
+
+
+def surface_distances(mesh: Mesh, points: Float[np.ndarray, "points 3"]) -> Float64[np.ndarray, " points"]:
+    """Distance of points to a surface, metres."""
+    return np.linalg.norm(closest_points(mesh, points)[0].astype(float) - points, axis=1)
 
 
 def _tensor(array: np.ndarray, dtype: type) -> Any:

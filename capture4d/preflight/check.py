@@ -15,8 +15,8 @@ import numpy as np
 
 from capture4d.cameras.coverage import camera_counts
 from capture4d.captures.placement import Placement, place, place_rig
+from capture4d.captures.scan_files import Surface
 from capture4d.colours.labels import OTHER, classify_colours
-from capture4d.mesh_files.polygons import MeshFile
 from capture4d.preflight.facts import BadFrame, Paints
 from capture4d.preflight.findings import Verdict
 from capture4d.preflight.mannequin import sample_surface
@@ -126,7 +126,7 @@ def _survey(take: TakeFolder, motion: CapturedMotion | None) -> Survey | None:
     posed = set() if motion is None else set(motion.rows)
     known = [number for number in take.files if not posed or number in posed]
     candidates = known or list(take.files)
-    probes: list[tuple[int, MeshFile]] = []
+    probes: list[tuple[int, Surface]] = []
     for part in np.array_split(np.array(candidates), min(PROBES, len(candidates))):
         for number in part[:20].tolist():
             found = read_frame(take.files[number], number)
@@ -139,7 +139,7 @@ def _survey(take: TakeFolder, motion: CapturedMotion | None) -> Survey | None:
 
 
 def _probe_motion(
-    take: TakeFolder, motion: CapturedMotion | None, probes: Sequence[tuple[int, MeshFile]]
+    take: TakeFolder, motion: CapturedMotion | None, probes: Sequence[tuple[int, Surface]]
 ) -> Motion | None:
     """Motion capture in the probe frames, and what of them is not the garment."""
     if motion is None:
@@ -154,7 +154,7 @@ def _probe_motion(
     return Motion(motion.model(), posed, meshes, known)
 
 
-def _bare(found: MeshFile, paints: Paints) -> Mesh | None:
+def _bare(found: Surface, paints: Paints) -> Mesh | None:
     """What of a scan is neither garment nor paint; None if that cannot be told, or is next to nothing."""
     if found.colours is None or paints.garment is None:
         return None
@@ -248,7 +248,7 @@ def _measure_run(measures: _Measures, job: _Job) -> tuple[list[FrameStatistics],
         if body is not None:
             body = body + np.array([0, measures.poses_lift_m, 0])
         frame = measure_frame(scan, measures.paints, rig=measures.rig, body=body, has_colours=colours is not None)
-        frame = replace(frame, time_s=time_stamp(file))
+        frame = replace(frame, time_s=time_stamp(file), estimated=found.estimated)
         if before is not None:
             frame = replace(frame, shift_m=surface_shift(before[1], mesh), shift_from=before[0])
         statistics.append(frame)

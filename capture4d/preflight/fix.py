@@ -8,6 +8,7 @@ stays as it is.
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from capture4d.captures.capture import Capture
+from capture4d.captures.description import parse_description
 from capture4d.captures.placement import Placement, place, place_rig
 from capture4d.captures.take_colours import template_loops
 from capture4d.colours.spaces import format_colour, parse_colour
@@ -28,6 +30,7 @@ from capture4d.preflight.facts import BadFrame
 from capture4d.preflight.statistics import outwardness
 from capture4d.preflight.take_folder import TakeFolder, read_frame
 from capture4d.runs.workers import run_jobs
+from capture4d.types import Mesh
 
 __all__ = ["fixed_path", "write_fixed"]
 
@@ -108,9 +111,9 @@ def _rewrite(job: _Job) -> int:
     if isinstance(found, BadFrame):
         return -1
     mesh = place(found.mesh, job.placement)
-    write_mesh(
-        job.target, mesh if found.colours is None else type(mesh)(mesh.vertices, mesh.faces), colours=found.colours
-    )
+    faces = mesh.faces[:0] if found.estimated else mesh.faces  # what was guessed is not made a fact
+    uv = mesh.uv if found.colours is None else None
+    write_mesh(job.target, Mesh(mesh.vertices, faces, uv), colours=found.colours)
     return job.frame_id
 
 
@@ -125,14 +128,13 @@ def _copy_companions(checked: Checked, output: Path) -> None:
     if take.poses_path is not None:
         poses, lift = load_poses(take.poses_path), np.array([0, checked.survey.poses_lift_m, 0], np.float32)
         save_poses(output / "poses.npz", replace(poses, translations=poses.translations + lift))
-    for suffix in READABLE:
-        bare = take.path / f"template{suffix}"
-        if bare.is_file():
+    for bare in sorted(take.path.glob("template.*")):
+        if bare.suffix.lower() in READABLE and bare.is_file():
             found = read_mesh(bare)
             # Whichever way the faces of the scans wind, its own have to look outwards in the end.
             own = replace(placement, flip=(outwardness(found.mesh) < 0) != placement.mirrors)
             sizes = None if own.flip else found.polygon_sizes
-            name = bare.name if suffix in WRITABLE else "template.ply"
+            name = bare.name if bare.suffix.lower() in WRITABLE else "template.ply"
             write_mesh(output / name, place(found.mesh, own), colours=found.colours, polygon_sizes=sizes)
     if take.rig is not None:
         factor = placement.scale / take.facts.declared
@@ -142,7 +144,8 @@ def _copy_companions(checked: Checked, output: Path) -> None:
 def _description(checked: Checked, written: list[int], output: Path) -> dict[str, Any]:
     """What capture.json said, with what the command line said over it."""
     take = checked.take
-    description = {"format": 1, "name": take.path.resolve().name, **take.description, "units": "m", "frames": written}
+    said = {entry: value for entry, value in take.description.items() if value is not None}
+    description = {"format": 1, "name": take.path.resolve().name, **said, "units": "m", "frames": written}
     if take.claims.garment_colour:
         description["garment_colour"] = format_colour(parse_colour(take.claims.garment_colour))
     if take.claims.border_colours:
@@ -160,10 +163,10 @@ def _description(checked: Checked, written: list[int], output: Path) -> dict[str
 def _named_borders(take: TakeFolder, output: Path, written: list[int]) -> dict[str, str]:
     """Colours of the borders that the command line gives, by the names that they have, or else as learned ones get."""
     given = list(dict.fromkeys(format_colour(parse_colour(colour)) for colour in take.claims.border_colours))
-    described = {
-        name: format_colour(parse_colour(colour))
-        for name, colour in take.description.get("boundary_colours", {}).items()
-    }
+    described: dict[str, str] = {}
+    with contextlib.suppress(InputError):  # what was given over it was not judged
+        said = parse_description({"boundary_colours": take.description.get("boundary_colours")}).boundary_colours
+        described = {name: format_colour(colour) for name, colour in said.items()}
     if set(described.values()) == set(given):
         return described
     if len(given) == 1:

@@ -74,6 +74,8 @@ class FrameStatistics:
     """Mean distance of the bare subject, of all of it if the garment's colour is not known, to the posed body."""
     time_s: float | None = None
     """Time stamp in the file."""
+    estimated: bool = False
+    """The file has points alone."""
 
 
 def measure_frame(

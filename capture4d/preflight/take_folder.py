@@ -16,13 +16,13 @@ import numpy as np
 from capture4d.body.anny import load_anny
 from capture4d.body.posed_surface import BodyState, TrackedBody, tracked_body
 from capture4d.body.skinning import ShapedBody, pose_frame, with_shape
-from capture4d.colours.spaces import parse_colour
+from capture4d.captures.description import Description, parse_description
+from capture4d.captures.scan_files import Surface, list_scans, read_surface
+from capture4d.colours.spaces import Colour, parse_colour
 from capture4d.errors import EmptyMeshError, InputError, NotFiniteError
 from capture4d.files.atomic import read_json
 from capture4d.files.records import load_body, load_poses, load_rig
-from capture4d.geometry.mesh import doubled_area_vectors
-from capture4d.mesh_files.meshes import READABLE, read_coloured_mesh
-from capture4d.mesh_files.polygons import MeshFile
+from capture4d.mesh_files.meshes import READABLE
 from capture4d.preflight.facts import BadFrame, Paints, TakeFacts
 from capture4d.types import PoseSequence, Rig
 from capture4d.units import METRES
@@ -81,12 +81,15 @@ def open_take(path: Path, claims: Claims | None = None) -> TakeFolder:
     description = read_json(described) if described.is_file() else {}
     if not isinstance(description, dict):
         raise InputError(f"expected a JSON object, found {type(description).__name__}", where=described)
+    try:
+        said = parse_description(_not_claimed(description, claims))
+    except InputError as error:
+        raise error.at(described) from None
     folder = path / "scans" if (path / "scans").is_dir() else path
-    found = _numbered_files(folder, claims.frames)
-    if not found:
+    found = list_scans(folder, claims.frames, companions_below=False)
+    if not found.scans:
         wanted = claims.frames or f"files with a frame number ({', '.join(READABLE)})"
         raise InputError(f"expected scans named {wanted}, found none", where=folder)
-    files = {number: names[0] for number, names in sorted(found.items())}
     poses_path, body_path = (
         given or (path / name if (path / name).is_file() else None)
         for given, name in ((claims.poses, "poses.npz"), (claims.body, "body.npz"))
@@ -94,89 +97,68 @@ def open_take(path: Path, claims: Claims | None = None) -> TakeFolder:
     rig_path = claims.rig or (path / "rig.json" if (path / "rig.json").is_file() else None)
     rig = load_rig(rig_path) if rig_path else None
     poses = load_poses(poses_path) if poses_path else None
-    try:
-        facts = _facts(description, claims, tuple(files), poses)
-    except InputError as error:
-        raise error.at(described) from None
-    except (AttributeError, TypeError, ValueError) as error:
-        raise InputError(f"{error}", where=described) from None
-    also = {number: tuple(names[1:]) for number, names in sorted(found.items()) if len(names) > 1}
-    facts = replace(facts, duplicated=tuple(also))
+    facts = replace(_facts(said, claims, tuple(found.scans), poses), duplicated=tuple(found.also))
     moving = poses is not None and (body_path is not None or poses.joint_names == load_anny().joint_names)
-    return TakeFolder(path, files, also, description, facts, rig, poses_path, body_path, moving, claims)
+    return TakeFolder(path, found.scans, found.also, description, facts, rig, poses_path, body_path, moving, claims)
 
 
 def _kind(path: Path) -> str:
     return "a file" if path.exists() else "nothing"
 
 
-def _numbered_files(folder: Path, pattern: str | None) -> dict[int, list[Path]]:
-    if pattern is not None and pattern.count("{frame}") != 1:
-        raise InputError(f"--frames: expected a file name with {{frame}} in it once, found '{pattern}'")
-    if pattern is not None:
-        before, after = (re.escape(part) for part in pattern.split("{frame}"))
-        named = re.compile(f"{before}(\\d+){after}")
-    else:
-        named = re.compile(r".*?(\d+)\D*")
-    files: dict[int, list[Path]] = {}
-    for file in sorted(folder.iterdir()):
-        if file.suffix.lower() not in READABLE or not file.is_file() or file.stem.startswith("template"):
-            continue
-        match = named.fullmatch(file.name if pattern is not None else file.stem)
-        if match:
-            files.setdefault(int(match[1]), []).append(file)
-    return files
+def _not_claimed(description: Mapping[str, Any], claims: Claims) -> dict[str, Any]:
+    """What capture.json says and the caller does not say over it."""
+    over = {
+        "fps": claims.fps,
+        "units": claims.units,
+        "garment_colour": claims.garment_colour,
+        "boundary_colours": claims.border_colours or None,
+    }
+    return {entry: value for entry, value in description.items() if over.get(entry) is None}
 
 
-def _facts(
-    description: Mapping[str, Any],
-    claims: Claims,
-    frame_ids: tuple[int, ...],
-    poses: PoseSequence | None,
-) -> TakeFacts:
-    units = claims.units or description.get("units", "m")
+def _facts(said: Description, claims: Claims, frame_ids: tuple[int, ...], poses: PoseSequence | None) -> TakeFacts:
+    units = claims.units or said.units
     declared = next((metres for name, metres in METRES.items() if name == units), None)
     if declared is None:
         raise InputError(f"units: expected one of {', '.join(METRES)}, found '{units}'")
-    fps = claims.fps if claims.fps is not None else description.get("fps")
-    if fps is not None and not float(fps) > 0:
+    fps = claims.fps if claims.fps is not None else said.fps
+    if fps is not None and not 0 < fps < float("inf"):
         raise InputError(f"fps: expected a positive frame rate, found {fps}")
-    garment = claims.garment_colour or description.get("garment_colour")
-    borders: dict[str, list[str]] = {}
+    garment = parse_colour(claims.garment_colour) if claims.garment_colour else said.garment_colour
+    borders: dict[Colour, list[str]] = {}
     if claims.border_colours:
-        borders = {colour: [colour] for colour in claims.border_colours}
+        borders = {parse_colour(colour): [colour] for colour in claims.border_colours}
     else:
-        for name, colour in description.get("boundary_colours", {}).items():
+        for name, colour in said.boundary_colours.items():
             borders.setdefault(colour, []).append(name)
-    listed = description.get("frames")
     return TakeFacts(
-        fps=None if fps is None else float(fps),
+        fps=fps,
         declared=declared,
-        paints=Paints(parse_colour(garment) if garment else None, tuple(parse_colour(colour) for colour in borders)),
+        paints=Paints(garment, tuple(borders)),
         border_names=tuple(tuple(names) for names in borders.values()),
         frame_ids=frame_ids,
-        listed=tuple(int(number) for number in listed) if listed else None,
-        dropped=tuple(int(number) for number in description.get("dropped_frames", ())),
+        listed=said.frames,
+        dropped=said.dropped,
         pose_frames=None if poses is None else tuple(int(number) for number in poses.frame_ids),
         pose_fps=None if poses is None else poses.fps,
     )
 
 
-def read_frame(path: Path, frame_id: int) -> MeshFile | BadFrame:
+def read_frame(path: Path, frame_id: int) -> Surface | BadFrame:
     """The scan in a file, or what is wrong with it."""
-    if path.stat().st_size == 0:
-        return BadFrame(frame_id, "frame-empty", f"{path}: an empty file")
     try:
-        found = read_coloured_mesh(path)
+        if path.stat().st_size == 0:
+            return BadFrame(frame_id, "frame-empty", f"{path}: an empty file")
+        return read_surface(path)
     except EmptyMeshError as error:
         return BadFrame(frame_id, "frame-empty", str(error))
     except NotFiniteError as error:
         return BadFrame(frame_id, "frame-nan", str(error))
     except InputError as error:
         return BadFrame(frame_id, "frame-unreadable", str(error))
-    if not np.any(doubled_area_vectors(found.mesh.vertices, found.mesh.faces)):
-        return BadFrame(frame_id, "frame-empty", f"{path}: all faces are without area")
-    return found
+    except OSError as error:  # it was there when the folder was listed
+        return BadFrame(frame_id, "frame-unreadable", f"{path}: {error.strerror}")
 
 
 def time_stamp(path: Path) -> float | None:

@@ -205,6 +205,9 @@ def _check_surface(facts: TakeFacts, frames: Sequence[FrameStatistics], limits: 
     yield _per_frame(
         "holes", ids, holes / limits.hole_share, f"holes of up to {100 * holes.max():.0f} % of the surface"
     )
+    clouds = [frame.frame_id for frame in frames if frame.estimated]
+    text = f"points alone in {_count(clouds)} of {len(frames)}; normals and faces are estimated"
+    yield Finding("faces-missing", text, _CERTAIN * bool(clouds), _sorted(clouds))
     first: dict[str, int] = {}
     copies = [frame.frame_id for frame in frames if first.setdefault(frame.content, frame.frame_id) != frame.frame_id]
     yield Finding(

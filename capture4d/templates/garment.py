@@ -17,13 +17,15 @@ from jaxtyping import Float32, Float64, Int32
 from capture4d.body.binding import WEIGHT_SMOOTHING, diffuse
 from capture4d.body.posed_surface import PosedSurface, match, tracked_body
 from capture4d.body.skinning import PosedBody, unskin
+from capture4d.captures.names import require_plain_names
 from capture4d.errors import InputError
 from capture4d.geometry.mesh import boundary_loops, edge_uses, half_edges, vertex_normals
+from capture4d.geometry.seams import welded_mesh
 from capture4d.geometry.uv_atlas import UvReport, check_uv, fresh_uv
 from capture4d.templates.config import UvChoice
 from capture4d.types import Body, Garment, Mesh
 
-__all__ = ["TemplateReport", "make_template", "name_loops", "weld"]
+__all__ = ["TemplateReport", "make_template", "name_loops"]
 
 FAR_M = 0.25
 """A garment whose vertices lie farther than this from the body, in the median, is not on it."""
@@ -55,14 +57,16 @@ def make_template(
     """Bind a mesh to the body it lies on, and take it to the rest pose.
 
     Args:
-        mesh: metres, in the world of the posed body.
+        mesh: metres, in the world of the posed body. Where it is split at seams, the template is joined; UVs, which
+            belong to face corners, stay.
         uv: keep the mesh's, cut `fresh` ones, have `none`; `auto` keeps them if nothing is wrong with them.
         names: of the loops, the one with the most vertices first; found by position if empty.
         source: what errors call the mesh.
     Raises:
         InputError: the mesh cannot be a template; says what was expected.
     """
-    _require_surface(mesh, source)
+    mesh, welded = welded_mesh(mesh)
+    _require_surface(mesh, source, against=welded.against)
     size = float(np.ptp(mesh.vertices, axis=0).max())
     if size < LEAST_SIZE_M:
         raise InputError(f"expected a garment, found a mesh of {1e3 * size:.2g} mm; its units differ", where=source)
@@ -114,16 +118,7 @@ def _bind(mesh: Mesh, body: PosedBody) -> tuple[np.ndarray, np.ndarray, np.ndarr
     return matches.faces, matches.barycentric.astype(np.float32), weights, matches.points
 
 
-def weld(mesh: Mesh) -> Mesh:
-    """Join vertices in the same place, which glb files split at UV seams; the first of each keeps its turn."""
-    _, first, inverse = np.unique(mesh.vertices, axis=0, return_index=True, return_inverse=True)
-    order = np.argsort(first)
-    renumbered = np.empty(len(first), np.int32)
-    renumbered[order] = np.arange(len(first), dtype=np.int32)
-    return Mesh(mesh.vertices[first[order]], renumbered[inverse.reshape(-1)][mesh.faces], mesh.uv)
-
-
-def _require_surface(mesh: Mesh, source: str) -> None:
+def _require_surface(mesh: Mesh, source: str, *, against: int) -> None:
     edges, uses = edge_uses(mesh.faces)
     if (edges[:, 0] == edges[:, 1]).any():
         bad = int(np.flatnonzero((np.diff(np.sort(mesh.faces, axis=1), axis=1) == 0).any(axis=1))[0])
@@ -138,7 +133,7 @@ def _require_surface(mesh: Mesh, source: str) -> None:
         raise InputError(f"expected every vertex in a face, found {unused} in none", where=source)
     if not (uses == 1).any():
         raise InputError("expected a garment with open borders, found a closed surface", where=source)
-    if _has_mixed_winding(mesh):
+    if against or _has_mixed_winding(mesh):
         raise InputError("expected faces wound alike, found neighbours wound against each other", where=source)
 
 
@@ -163,6 +158,7 @@ def _loop_names(
 ) -> tuple[str, ...]:
     if not names:
         return name_loops(loops, weights, rest, body)
+    require_plain_names(names, "border")
     if len(names) != len(loops) or len(set(names)) != len(names):
         sizes = ", ".join(str(len(loop)) for loop in loops)
         raise InputError(f"expected {len(loops)} different names for loops of {sizes} vertices, "

@@ -17,7 +17,7 @@ from capture4d.motions.motion_files import read_motion, told
 from capture4d.runs.stage import StageResult
 from capture4d.templates.body_regions import body_region
 from capture4d.templates.config import TEMPLATE, TemplateConfig
-from capture4d.templates.garment import TemplateReport, make_template, weld
+from capture4d.templates.garment import TemplateReport, make_template
 from capture4d.types import Body, Garment
 from capture4d.units import METRES
 
@@ -64,7 +64,6 @@ def run(
     else:
         surface, source = read_mesh(mesh).mesh, str(mesh)
         surface = surface.with_vertices(surface.vertices * np.float32(METRES[config.mesh_units]))
-        surface = weld(surface) if mesh.suffix.lower() == ".glb" else surface
     garment, report = make_template(surface, posed, uv=config.uv, names=config.loop_names, source=source)
     save_garment(output, garment)
     return TemplateResult(output, file_digest([output], root=output.parent), garment=garment, report=report)

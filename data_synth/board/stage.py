@@ -10,6 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from capture4d.cameras.board import Board, parse_board
+from capture4d.captures.names import require_plain_names
+from capture4d.errors import InputError
 from capture4d.files.atomic import file_digest, write_bytes
 from capture4d.files.records import load_rig
 from capture4d.runs.stage import StageResult, open_stage
@@ -52,6 +54,7 @@ def run(rig_path: Path, images: Path, config: BoardConfig, *, workers: int = 1, 
         InputError: the board or the rig cannot be read, or the folder holds something else.
     """
     board, rig = parse_board(config.board), load_rig(rig_path)
+    _require_folder_names(rig, rig_path)
     upstream = {"rig": file_digest([rig_path], root=rig_path.parent)}
     stage = open_stage(images, name="synth-board", schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite)
     poses, seen = _shoot(rig, board, config)
@@ -75,6 +78,14 @@ def shared_volume(rig: Rig) -> tuple[Float64[np.ndarray, " 3"], float]:
     fisheye = np.array([lens == "fisheye" for lens in rig.lenses])[:, None]
     sine = np.sin(np.where(fisheye, half.clip(max=np.pi / 2), np.arctan(half))).min(axis=1)
     return centre, float((np.linalg.norm(rig.centres - centre, axis=1) * sine).min())
+
+
+def _require_folder_names(rig: Rig, rig_path: Path) -> None:
+    """Cameras name the folders of their images."""
+    try:
+        require_plain_names(rig.names, "camera")
+    except InputError as error:
+        raise error.at(rig_path) from None
 
 
 def _shoot(

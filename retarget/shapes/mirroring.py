@@ -16,7 +16,7 @@ from jaxtyping import Float, Float32, Int64
 from scipy import sparse
 
 from capture4d.errors import InputError
-from capture4d.geometry.closest_points import closest_points
+from capture4d.geometry.ray_casting import closest_points
 from capture4d.types import Mesh, PoseSequence
 
 __all__ = ["Mirror", "find_mirror", "opposite_joints"]

@@ -5,6 +5,7 @@ docs/reference/report.md defines every metric. Those against truth appear where 
 
 from __future__ import annotations
 
+import contextlib
 import math
 import platform
 from collections.abc import Mapping, Sequence
@@ -36,6 +37,7 @@ from capture4d.app.report.stages import (
 from capture4d.captures.capture import Capture, read_capture
 from capture4d.captures.truth import TruthModel, read_truth_model, read_truth_vertices
 from capture4d.captures.work_folder import VERDICTS, WorkFolder
+from capture4d.errors import InputError
 from capture4d.evaluation import correspondence_errors, material_points
 from capture4d.files.atomic import read_json, write_bytes, write_json
 from capture4d.runs.stage import StageResult, open_stage, require_complete, result_of
@@ -189,13 +191,22 @@ def _measure_truth(scene: _Scene, records: list[dict[str, Any]], config: ReportC
     for row, measures in run_jobs(
         _measure_row, rows, prepare=shared(scene), workers=workers, label="measure against truth"
     ):
-        records[row].update(measures)
+        if isinstance(measures, str):
+            flagged = records[row]
+            verdict = "check" if flagged["verdict"] == "good" else flagged["verdict"]
+            flagged |= {"verdict": verdict, "reasons": [*flagged["reasons"], f"no truth: {measures}"]}
+        else:
+            records[row].update(measures)
 
 
-def _measure_row(scene: _Scene, row: int) -> tuple[int, dict[str, float]]:
+def _measure_row(scene: _Scene, row: int) -> tuple[int, dict[str, float] | str]:
+    """The measures of a frame, or why there are none."""
     registered, model = scene.work.registered, scene.truth
     assert model is not None
-    vertices = read_truth_vertices(scene.capture, int(registered.frame_ids[row]))
+    try:
+        vertices = read_truth_vertices(scene.capture, int(registered.frame_ids[row]), model=model)
+    except InputError as error:
+        return row, str(error)
     return row, truth_measures(registered, row, model, vertices)
 
 
@@ -220,10 +231,11 @@ def _draw_row(scene: _Scene, job: _DrawJob) -> tuple[int, list[list[Panel]]]:
     if "fit error" in job.scales:
         errors["fit error"] = (1e3 * registered.residual_m[row].astype(float), job.scales["fit error"])
     if model is not None and "correspondence error" in job.scales:
-        fine = read_truth_vertices(capture, frame_id)
-        places = material_points(fine, model.fine.faces, model.template_faces, model.template_barycentric)
-        values = 1e3 * correspondence_errors(vertices, places)
-        errors["correspondence error"] = (values, job.scales["correspondence error"])
+        with contextlib.suppress(InputError):  # the frame was flagged when it was measured
+            fine = read_truth_vertices(capture, frame_id, model=model)
+            places = material_points(fine, model.fine.faces, model.template_faces, model.template_barycentric)
+            values = 1e3 * correspondence_errors(vertices, places)
+            errors["correspondence error"] = (values, job.scales["correspondence error"])
     return row, draw_frame(
         readable_scan(capture, frame_id),
         registered.garment,

@@ -10,7 +10,7 @@ from capture4d.evaluation import (
     material_points,
     truth_distances,
 )
-from capture4d.geometry.closest_points import closest_points, surface_distances
+from capture4d.geometry.ray_casting import closest_points, surface_distances
 from tests.shapes import plane
 
 

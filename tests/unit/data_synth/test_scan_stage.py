@@ -11,8 +11,8 @@ from capture4d.errors import InputError
 from capture4d.evaluation import material_points
 from capture4d.files.atomic import read_json
 from capture4d.files.records import load_garment, load_rig
-from capture4d.geometry.closest_points import surface_distances
 from capture4d.geometry.mesh import boundary_loops, face_areas
+from capture4d.geometry.ray_casting import surface_distances
 from capture4d.mesh_files.meshes import write_mesh
 from capture4d.types import Mesh
 from data_synth.mesh_sequence import open_sequence

@@ -135,3 +135,52 @@ def test_schedules_anneal_geometrically() -> None:
     schedule = Schedule(3, (0.1, 0.001))
     assert [anneal(schedule.gate, step, 3) for step in range(3)] == pytest.approx([0.1, 0.01, 0.001])
     assert anneal((0.0, 4.0), 1, 3) == 2.0
+
+
+def split_at_seams(mesh: Mesh) -> Mesh:
+    """As a file has it that keeps texture coordinates per vertex: three charts, no vertex in two of them."""
+    middle = mesh.vertices[mesh.faces].mean(axis=1)
+    chart = (middle[:, 0] > 0) + 2 * (middle[:, 1] > 0.3)
+    keys, corners = np.unique(mesh.faces * 4 + chart[:, None], return_inverse=True)
+    return Mesh(mesh.vertices[keys // 4], corners.reshape(-1, 3).astype(np.int32))
+
+
+@pytest.mark.parametrize("kind", ["ply", "obj", "glb"])
+def test_seams_of_a_template_stay_closed_bit_for_bit(kind: str, garment, scan_of, quick, tmp_path: Path) -> None:
+    import trimesh
+
+    whole = garment.template
+    parts = split_at_seams(whole)
+    trimesh.Trimesh(parts.vertices, parts.faces, process=False).export(tmp_path / f"template.{kind}")
+    parts = read_mesh(tmp_path / f"template.{kind}").mesh
+    write_mesh(tmp_path / "scan.ply", scan_of(swell).mesh)
+    result = run(tmp_path / f"template.{kind}", tmp_path / "scan.ply", tmp_path / "out.ply", quick)
+    found = read_mesh(tmp_path / "out.ply").mesh
+    np.testing.assert_array_equal(found.faces, parts.faces)
+    assert len(found.vertices) == len(parts.vertices) > len(whole.vertices)
+    for values in (found.vertices, result.start, result.quality.residual_m, result.quality.stretch):
+        for place in np.unique(parts.vertices, axis=0)[::5]:
+            here = values[(parts.vertices == place).all(axis=1)]
+            assert len({value.tobytes() for value in here}) == 1
+    unsplit = register_mesh(whole, scan_of(swell).mesh, config=quick)
+    assert result.quality.numbers["fit_mean_mm"] == pytest.approx(unsplit.quality.numbers["fit_mean_mm"], rel=0.15)
+
+
+@pytest.mark.parametrize("kind", ["ply", "obj"])
+def test_a_scan_may_be_points_alone(kind: str, garment, scan_of, quick, tmp_path: Path) -> None:
+    write_mesh(tmp_path / "template.obj", garment.template)
+    scan = scan_of(swell, noise=0.0003).mesh
+    write_mesh(tmp_path / "mesh.ply", scan)
+    write_mesh(tmp_path / f"cloud.{kind}", Mesh(scan.vertices, scan.faces[:0]))
+    truth, off = swell(garment.template.vertices.astype(float)), {}
+    for name in ("mesh.ply", f"cloud.{kind}"):
+        result = run(tmp_path / "template.obj", tmp_path / name, tmp_path / "out.ply", quick)
+        off[result.estimated] = np.linalg.norm(result.vertices - truth, axis=1).mean()
+        told = json.loads((tmp_path / "out.json").read_text())["scan_faces"]
+        assert told == ("estimated" if result.estimated else "given")
+    assert off[True] < 1.15 * off[False]
+    write_mesh(tmp_path / "few.ply", Mesh(scan.vertices[:40], scan.faces[:0]))
+    with pytest.raises(InputError, match=r"few\.ply: expected a mesh, or a cloud of at least 100 points"):
+        run(tmp_path / "template.obj", tmp_path / "few.ply", tmp_path / "out.ply", quick)
+    with pytest.raises(InputError, match=r"cloud\.\w+: empty mesh, found \d+ vertices and no faces"):
+        run(tmp_path / f"cloud.{kind}", tmp_path / "mesh.ply", tmp_path / "out.ply", quick)

@@ -14,8 +14,8 @@ from capture4d.captures.work_folder import REGISTER, VERDICTS, stack_vertices
 from capture4d.cli.main import main
 from capture4d.files.atomic import write_bytes, write_npz
 from capture4d.files.records import save_body, save_garment, save_poses
-from capture4d.geometry.closest_points import closest_points
 from capture4d.geometry.mesh import boundary_loops
+from capture4d.geometry.ray_casting import closest_points
 from capture4d.runs.stage import open_stage
 from capture4d.types import Body, Garment, PoseSequence, RegisteredSequence
 from tests.shapes import tube

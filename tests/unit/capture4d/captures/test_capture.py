@@ -34,6 +34,7 @@ from capture4d.errors import InputError
 from capture4d.files.records import load_body, load_garment, load_rig, save_body, save_garment, save_poses, save_rig
 from capture4d.mesh_files.meshes import write_mesh
 from capture4d.types import Body, Garment, Mesh, PoseSequence, Scan
+from tests.shapes import tube
 
 FRAMES = (11, 12, 15)
 SQUARE = Mesh(
@@ -93,7 +94,7 @@ def test_colours_round_trip():
     [
         (lambda entries: entries.pop("fps"), "expected the entry 'fps'"),
         (lambda entries: entries.update(fps=0), "expected a positive frame rate, found 0"),
-        (lambda entries: entries.update(fps="fast"), "could not convert"),
+        (lambda entries: entries.update(fps="fast"), "fps: expected a number, found 'fast'"),
         (lambda entries: entries.update(format=7), "expected format 1, found 7"),
         (lambda entries: entries.update(units="inch"), "expected units m, cm, mm, in, found 'inch'"),
         (lambda entries: entries.update(garment_colour="blue"), "expected a colour such as #2f62c9, found 'blue'"),
@@ -304,3 +305,40 @@ def test_a_bare_mesh_is_a_template_with_its_loops(capture: Capture):
     garment = capture.template
     assert {name: len(loop) for name, loop in garment.loops.items()} == {"border_0": 4}
     assert garment.skin_weights is None
+
+
+@pytest.mark.parametrize("name", ["template.ply", "template.GLB", "template.obj"])
+def test_a_bare_template_is_joined_at_its_seams(name: str, capture: Capture):
+    mesh = tube(12, 5)
+    parts = Mesh(mesh.vertices[mesh.faces].reshape(-1, 3), np.arange(mesh.faces.size, dtype=np.int32).reshape(-1, 3))
+    write_mesh(capture.path / name, parts)
+    found = replace(capture).template
+    assert {loop: len(vertices) for loop, vertices in found.loops.items()} == {"border_0": 12, "border_1": 12}
+    assert len(found.template.vertices) == len(mesh.vertices)
+
+
+def test_a_template_whose_borders_lead_elsewhere_is_refused(capture: Capture):
+    save_garment(capture.path / "template.npz", Garment(SQUARE, {"../hem": np.array([0, 1], np.int32)}))
+    with pytest.raises(InputError, match=r"template\.npz: name of a border: expected .*found '\.\./hem'"):
+        _ = replace(capture).template
+
+
+def test_the_buffers_of_a_gltf_template_count(capture: Capture):
+    (capture.path / "template.gltf").write_text("{}")
+    digests = []
+    for text in (b"one", b"two"):
+        (capture.path / "template.bin").write_bytes(text)
+        digests.append(replace(capture).template_digest)
+    assert digests[0] != digests[1]
+
+
+def test_the_truth_of_another_garment_is_refused(capture: Capture):
+    zeros = np.zeros((2, 3), np.float32)
+    model = TruthModel(SQUARE, {}, np.zeros(2, np.int32), zeros)
+    frame = TruthFrame(zeros, np.zeros((1, 3, 3), np.float32), zeros[0], np.zeros(4, np.uint8))
+    write_truth_frame(capture.path / "truth" / "000011.npz", frame)
+    assert len(read_truth_vertices(capture, 11)) == 2
+    with pytest.raises(
+        InputError, match=r"truth/000011\.npz: expected 4 finite float32 vertices, found float32 of \(2, 3\)"
+    ):
+        read_truth_vertices(capture, 11, model=model)

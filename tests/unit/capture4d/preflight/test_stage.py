@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from capture4d.body.anny import load_anny
 from capture4d.body.skinning import pose_frame, with_shape
+from capture4d.captures.capture import read_capture, read_frame
 from capture4d.captures.placement import Placement, place, place_rig
 from capture4d.cli.main import main
 from capture4d.colours.spaces import to_lab
@@ -477,7 +478,7 @@ def test_a_folder_of_scans_is_enough(sound: dict[int, Scan], tmp_path: Path, cap
         ([], "{", "not valid JSON"),
         ([], "[]", "expected a JSON object"),
         ([], '{"fps": -1}', "expected a positive frame rate"),
-        ([], '{"units": "furlong"}', "expected one of m, cm, mm, in"),
+        ([], '{"units": "furlong"}', "expected units m, cm, mm, in"),
         ([], '{"garment_colour": "blue"}', "expected a colour such as"),
     ],
 )
@@ -506,3 +507,23 @@ def test_nothing_there_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture
             main(["check", str(folder)])
         assert exit_.value.code == 1
         assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("borders", [None, {"../x": "ffc400"}])
+def test_what_the_command_line_says_replaces_what_was_wrong(
+    borders: object, sound: dict[int, Scan], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """The corrected take can be read, with clouds as clouds, under names that were not its files'."""
+    clouds = {
+        number: replace(scan, mesh=Mesh(scan.mesh.vertices, scan.mesh.faces[:0])) for number, scan in sound.items()
+    }
+    take = write(tmp_path / "take", clouds, boundary_colours=borders, name=None, fps="fast")
+    (take / "scans" / "000012.ply").rename(take / "scans" / "12_.PLY")
+    write_mesh(take / "template.PLY", sound[10].mesh)
+    _, found = check(capsys, take, "--fix", "--border-colour", "ffc400", "--fps", "30", "--garment-colour", "2f62c9")
+    assert "faces-missing" in codes(found)
+    fixed = read_capture(tmp_path / "take-fixed")
+    assert set(fixed.boundary_colours.values()) == {YELLOW}
+    assert (fixed.frame_ids, fixed.fps) == ((10, 11, 12, 13, 14), 30.0)
+    assert read_frame(fixed, 12)[1], "what was guessed is not made a fact"
+    assert len(fixed.template.template.vertices)

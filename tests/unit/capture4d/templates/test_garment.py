@@ -15,11 +15,12 @@ from capture4d.cli.main import main
 from capture4d.errors import InputError
 from capture4d.files.records import load_garment, save_body, save_poses
 from capture4d.geometry.mesh import boundary_loops, unique_edges
+from capture4d.geometry.seams import welded_mesh
 from capture4d.geometry.uv_atlas import check_uv, fresh_uv
 from capture4d.mesh_files.meshes import write_mesh
 from capture4d.templates.body_regions import body_region
 from capture4d.templates.config import Region, TemplateConfig
-from capture4d.templates.garment import make_template, weld
+from capture4d.templates.garment import make_template
 from capture4d.templates.stage import run
 from capture4d.types import Mesh
 from data_synth.motions import CLIPS, scripted_clip
@@ -84,17 +85,18 @@ def test_a_posed_mesh_in_centimetres_comes_back_to_the_rest_pose(tmp_path: Path,
         run(tmp_path / "shirt.obj", tmp_path / "t.npz", TemplateConfig(pose_frame=7), poses=motion)
 
 
-def test_seams_of_a_glb_are_sewn_up(tmp_path: Path, person: ShapedBody) -> None:
+@pytest.mark.parametrize("kind", ["glb", "ply", "obj"])
+def test_seams_are_sewn_up(kind: str, tmp_path: Path, person: ShapedBody) -> None:
     mesh = body_region(person, "shorts")
     split = Mesh(
         mesh.vertices[mesh.faces].reshape(-1, 3), np.arange(3 * len(mesh.faces), dtype=np.int32).reshape(-1, 3)
     )
-    sewn = weld(split)
+    sewn, _ = welded_mesh(split)
     assert len(sewn.vertices) == len(mesh.vertices)
     assert len(unique_edges(sewn.faces)) == len(unique_edges(mesh.faces))
     np.testing.assert_array_equal(sewn.vertices[sewn.faces], mesh.vertices[mesh.faces])
-    write_mesh(tmp_path / "shorts.glb", split)
-    garment = run(tmp_path / "shorts.glb", tmp_path / "template.npz").garment
+    write_mesh(tmp_path / f"shorts.{kind}", split)
+    garment = run(tmp_path / f"shorts.{kind}", tmp_path / "template.npz").garment
     assert set(garment.loops) == LOOPS["shorts"]
 
 

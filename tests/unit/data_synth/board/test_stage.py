@@ -15,6 +15,7 @@ from capture4d.files.records import load_rig, save_rig
 from data_synth.board.stage import run, shared_volume
 from data_synth.config import BoardConfig
 from data_synth.scanner.rig import capture_rig
+from tests.shapes import ring
 
 CENTRE, RADIUS = (0.2, 1.3, -0.1), 0.6
 CONFIG = BoardConfig(poses=16, seed=3)
@@ -69,3 +70,12 @@ def test_other_boards_and_none_are_refused(photographed: tuple[Path, Path], tmp_
         BoardConfig(poses=0)
     with pytest.raises(InputError, match="expected"):
         run(rig, tmp_path / "images", BoardConfig(board="chess"))
+
+
+@pytest.mark.parametrize("name", ["../../outside", "a/b", "/tmp/x", "nul", "a\x1bb", ""])
+def test_a_camera_does_not_say_where_its_images_go(name: str, tmp_path: Path):
+    rig = ring(2)
+    save_rig(tmp_path / "rig.json", replace(rig, names=("cam00", name)))
+    with pytest.raises(InputError, match=r"rig\.json: name of a camera: expected"):
+        run(tmp_path / "rig.json", tmp_path / "images", CONFIG)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["rig.json"]

@@ -230,3 +230,24 @@ def test_a_calibrated_rig_is_shown_with_its_uncertainty(work):
     assert "<h2>Rig</h2>" in page
     assert "1,234 corners" in page
     assert "0.123" in page
+
+
+@pytest.mark.parametrize("damage", [b"", b"PK\x03\x04nothing", None])
+def test_the_truth_of_one_frame_may_be_damaged(work, damage: bytes | None):
+    path = work / "capture" / "truth" / "000003.npz"
+    path.unlink() if damage is None else path.write_bytes(damage)
+    draw(work, config=ReportConfig(pictures=4))
+    metrics = metrics_of(work)
+    assert (metrics["frames_check"], metrics["frames_failed"]) == (1, 1)
+    assert metrics["drift_mm_per_frame"] == pytest.approx(1, rel=0.1)
+    assert "no truth: " in (page := (work / "report" / "index.html").read_text())
+    assert "truth/000003.npz" in page
+
+
+def test_names_of_a_capture_are_escaped(work):
+    path = work / "capture" / "capture.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "name": "<script>alert(1)</script>"}))
+    draw(work, config=ReportConfig(pictures=1))
+    page = (work / "report" / "index.html").read_text()
+    assert "<script>alert" not in page
+    assert "&lt;script&gt;alert(1)" in page
