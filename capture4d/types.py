@@ -18,6 +18,8 @@ from jaxtyping import Float32, Int32, UInt8
 from capture4d.errors import InputError, NotFiniteError
 
 __all__ = [
+    "LARGEST_RATE",
+    "SMALLEST_RATE",
     "BlendshapeModel",
     "Body",
     "Garment",
@@ -27,7 +29,22 @@ __all__ = [
     "RegisteredSequence",
     "Rig",
     "Scan",
+    "require_frame_rate",
 ]
+
+SMALLEST_RATE, LARGEST_RATE = 0.01, 100_000.0
+"""Frames a second that are believed: from one in a minute or two to what high-speed cameras do."""
+_ROTATION = 2e-3
+"""What rotations may err, as entries of R^T R - I: other people's are rounded to three digits."""
+_SUM = 1e-3
+"""What weights that sum to 1 may err."""
+
+
+def require_frame_rate(owner: str, fps: float) -> None:
+    """Raises InputError where a frame rate is none."""
+    if not SMALLEST_RATE <= fps <= LARGEST_RATE:
+        expected = f"a frame rate from {SMALLEST_RATE:g} to {LARGEST_RATE:g}"
+        raise InputError(f"{owner}: expected {expected}, found {fps:g}")
 
 
 def _require_array(owner: str, name: str, value: Any, shape: tuple[int | None, ...], dtype: type) -> None:
@@ -52,6 +69,53 @@ def _require_indices(owner: str, name: str, value: np.ndarray, count: int) -> No
     if value.size and (value.min() < 0 or value.max() >= count):
         found = int(value.min()) if value.min() < 0 else int(value.max())
         raise InputError(f"{owner}.{name}: expected indices from 0 to {count - 1}, found {found}")
+
+
+def _require_rotations(owner: str, name: str, value: np.ndarray) -> None:
+    """Matrices (..., 3, 3) that turn, and neither scale nor mirror."""
+    flat = value.reshape(-1, 3, 3)
+    error = np.abs(np.einsum("nki,nkj->nij", flat, flat) - np.eye(3, dtype=flat.dtype)).reshape(len(flat), 9)
+    turned = np.einsum("ni,ni->n", np.cross(flat[:, 0], flat[:, 1]), flat[:, 2])
+    wrong = np.flatnonzero(~(error.max(axis=1, initial=0) <= _ROTATION) | ~(turned > 0))
+    if len(wrong):
+        frame, joint = divmod(int(wrong[0]), max(value.shape[1], 1))
+        found = "a reflection" if turned[wrong[0]] < 0 else f"a matrix {error[wrong[0]].max():.2g} off"
+        raise InputError(f"{owner}.{name}: expected rotations, found {found} in row {frame}, joint {joint}")
+
+
+def _require_weights(owner: str, name: str, value: np.ndarray) -> None:
+    """Rows that share out 1."""
+    _require_finite(owner, name, value)
+    off = np.abs(value.sum(axis=1, dtype=np.float64) - 1)
+    if off.max(initial=0) > _SUM:
+        row = int(off.argmax())
+        raise InputError(f"{owner}.{name}: expected rows that sum to 1, found {value[row].sum():.4g} in row {row}")
+    if value.min(initial=0) < -_SUM:
+        raise InputError(f"{owner}.{name}: expected no negative weights, found {value.min():.4g}")
+
+
+def _require_frames(owner: str, frame_ids: np.ndarray) -> None:
+    """Numbers from 0 up, each once."""
+    if len(np.unique(frame_ids)) != len(frame_ids):
+        raise InputError(f"{owner}.frame_ids: expected every frame once, found duplicates")
+    if frame_ids.min(initial=0) < 0:
+        raise InputError(f"{owner}.frame_ids: expected frame numbers from 0, found {frame_ids.min()}")
+
+
+def _require_names(owner: str, name: str, value: tuple[str, ...]) -> None:
+    """Texts, each once."""
+    strange = [each for each in value if not isinstance(each, str)]
+    if strange:
+        raise InputError(f"{owner}.{name}: expected texts, found {strange[0]!r}"[:200])
+    if len(set(value)) < len(value):
+        twice = next(each for row, each in enumerate(value) if each in value[:row])
+        raise InputError(f"{owner}.{name}: expected every name once, found {twice[:80]!r} again")
+
+
+def _require_loop(name: str, loop: np.ndarray) -> None:
+    if len(loop) < 3 or len(np.unique(loop)) < len(loop):
+        found = f"{len(loop)}" if len(loop) < 3 else "one that is there twice"
+        raise InputError(f"Garment.loops[{name!r}]: expected at least 3 vertices, once each, found {found}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,7 +202,10 @@ class GarmentScan:
         _require_array("GarmentScan", "boundary_points", self.boundary_points, (None, 3), np.float32)
         _require_array("GarmentScan", "boundary_loops", self.boundary_loops, (len(self.boundary_points),), np.int32)
         _require_finite("GarmentScan", "boundary_points", self.boundary_points)
-        _require_indices("GarmentScan", "boundary_loops", self.boundary_loops + 1, len(self.loop_names) + 1)
+        _require_names("GarmentScan", "loop_names", self.loop_names)
+        _require_indices(
+            "GarmentScan", "boundary_loops", self.boundary_loops.astype(np.int64) + 1, len(self.loop_names) + 1
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -172,14 +239,21 @@ class Body:
         _require_array("Body", "joint_directions", self.joint_directions, (shapes, joints, 3), np.float32)
         _require_array("Body", "parents", self.parents, (joints,), np.int32)
         _require_array("Body", "skin_weights", self.skin_weights, (verts, joints), np.float32)
-        for name in ("shape_directions", "joints", "joint_directions", "skin_weights"):
+        for name in ("shape_directions", "joints", "joint_directions"):
             _require_finite("Body", name, getattr(self, name))
+        _require_names("Body", "joint_names", self.joint_names)
+        if not joints:
+            raise InputError("Body.joint_names: expected at least one joint, found none")
         if self.pose_directions is not None:
+            features = 9 * (joints - 1)
+            _require_array("Body", "pose_directions", self.pose_directions, (features, verts, 3), np.float32)
             _require_finite("Body", "pose_directions", self.pose_directions)
+        if self.regions is not None:
+            _require_array("Body", "regions", self.regions, (verts,), np.uint8)
+            _require_indices("Body", "regions", self.regions, 4)
         if self.parents[0] != -1 or (self.parents[1:] >= np.arange(1, joints)).any() or (self.parents[1:] < 0).any():
             raise InputError("Body.parents: expected joint 0 as the root and every parent before its children")
-        if np.abs(self.skin_weights.sum(axis=1) - 1).max(initial=0) > 1e-3:
-            raise InputError("Body.skin_weights: expected rows that sum to 1")
+        _require_weights("Body", "skin_weights", self.skin_weights)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -207,10 +281,10 @@ class PoseSequence:
         _require_finite("PoseSequence", "rotations", self.rotations)
         _require_finite("PoseSequence", "translations", self.translations)
         _require_finite("PoseSequence", "shape", self.shape)
-        if not self.fps > 0:
-            raise InputError(f"PoseSequence.fps: expected a positive frame rate, found {self.fps}")
-        if len(np.unique(self.frame_ids)) != frames:
-            raise InputError("PoseSequence.frame_ids: expected every frame once, found duplicates")
+        _require_rotations("PoseSequence", "rotations", self.rotations)
+        _require_names("PoseSequence", "joint_names", self.joint_names)
+        require_frame_rate("PoseSequence.fps", self.fps)
+        _require_frames("PoseSequence", self.frame_ids)
 
     def row(self, frame_id: int) -> int:
         """Where a frame's pose is.
@@ -261,17 +335,18 @@ class Garment:
         for name, loop in self.loops.items():
             _require_array("Garment", f"loops[{name!r}]", loop, (None,), np.int32)
             _require_indices("Garment", f"loops[{name!r}]", loop, verts)
-        if self.embedding_faces is not None:
+            _require_loop(name, loop)
+        if self.embedding_faces is not None or self.embedding_barycentric is not None:
             _require_array("Garment", "embedding_faces", self.embedding_faces, (verts,), np.int32)
+            _require_indices("Garment", "embedding_faces", self.embedding_faces, 2**31)
             _require_array("Garment", "embedding_barycentric", self.embedding_barycentric, (verts, 3), np.float32)
+            _require_weights("Garment", "embedding_barycentric", self.embedding_barycentric)
         if self.body_shape is not None:
             _require_array("Garment", "body_shape", self.body_shape, (None,), np.float32)
             _require_finite("Garment", "body_shape", self.body_shape)
         if self.skin_weights is not None:
             _require_array("Garment", "skin_weights", self.skin_weights, (verts, None), np.float32)
-            _require_finite("Garment", "skin_weights", self.skin_weights)
-            if np.abs(self.skin_weights.sum(axis=1) - 1).max(initial=0) > 1e-3:
-                raise InputError("Garment.skin_weights: expected rows that sum to 1")
+            _require_weights("Garment", "skin_weights", self.skin_weights)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -290,6 +365,7 @@ class RegisteredSequence:
         _require_array("RegisteredSequence", "residual_m", self.residual_m, (frames, verts), np.float32)
         _require_array("RegisteredSequence", "frame_ids", self.frame_ids, (frames,), np.int32)
         _require_finite("RegisteredSequence", "vertices", self.vertices)
+        _require_frames("RegisteredSequence", self.frame_ids)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -322,11 +398,13 @@ class BlendshapeModel:
         _require_array("BlendshapeModel", "std", self.std, (shapes,), np.float32)
         for name in ("mean", "basis", "std"):
             _require_finite("BlendshapeModel", name, getattr(self, name))
+        if self.std.min(initial=0) < 0:
+            raise InputError(f"BlendshapeModel.std: expected no negative deviation, found {self.std.min():.4g}")
+        _require_names("BlendshapeModel", "joint_names", self.joint_names)
         weights = self.garment.skin_weights
         if weights is None or weights.shape[1] != len(self.joint_names):
             found = "none" if weights is None else f"weights for {weights.shape[1]}"
             raise InputError(
                 f"BlendshapeModel: expected skin weights for {len(self.joint_names)} joints, found {found}"
             )
-        if not self.fps > 0:
-            raise InputError(f"BlendshapeModel.fps: expected a positive frame rate, found {self.fps}")
+        require_frame_rate("BlendshapeModel.fps", self.fps)
