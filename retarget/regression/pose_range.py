@@ -15,6 +15,8 @@ from jaxtyping import Float, Float32, Float64, Int64
 from scipy.spatial.transform import Rotation
 
 from capture4d.errors import InputError
+from capture4d.files.json_values import number, wholes
+from capture4d.files.reading import reading
 from capture4d.files.tensors import read_tensors, write_tensors
 from capture4d.types import PoseSequence
 
@@ -76,6 +78,13 @@ def load_pose_range(path: Path, *, model_digest: str) -> PoseRange:
     file = read_tensors(path, _KIND)
     if file.entry("model") != model_digest:
         raise InputError("expected the poses of the blendshapes beside it, found those of another model", where=path)
-    return PoseRange(
-        file["quaternions"], tuple(int(joint) for joint in file.entry("joints")), float(file.entry("validated_deg"))
-    )
+    with reading(path, "file of training poses"):
+        joints = wholes(file.entry("joints"), "joints")
+        validated_deg = number(file.entry("validated_deg"), "validated_deg")
+        quaternions = file["quaternions"]
+        if quaternions.dtype != np.float32 or quaternions.shape[1:] != (len(joints), 4):
+            found = f"{quaternions.dtype} of {quaternions.shape}"
+            raise InputError(f"expected quaternions of {len(joints)} joints as float32, found {found}")
+        if not (np.abs(np.linalg.norm(quaternions, axis=2) - 1) < 1e-3).all():
+            raise InputError("expected quaternions of length 1, found others")
+        return PoseRange(quaternions, joints, validated_deg)

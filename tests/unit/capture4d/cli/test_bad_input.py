@@ -116,7 +116,7 @@ def broken_rigs(folder: Path) -> dict[str, str]:
         "not valid JSON": json.dumps(good)[:-40],
         "cameras[1]: expected the entry 'intrinsics', found none": json.dumps(without),
         "T_camera_world: expected 4 entries, found 2": json.dumps(bent),
-        "Rig.intrinsics": json.dumps(lost),
+        "expected finite numbers, found NaN": json.dumps(lost),
         "expected the entry 'cameras'": json.dumps({"rig": []}),
         "expected a JSON object": "[]",
         "expected at least one camera": '{"format": 1, "cameras": []}',
