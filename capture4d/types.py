@@ -336,7 +336,9 @@ class Garment:
             _require_array("Garment", f"loops[{name!r}]", loop, (None,), np.int32)
             _require_indices("Garment", f"loops[{name!r}]", loop, verts)
             _require_loop(name, loop)
-        if self.embedding_faces is not None or self.embedding_barycentric is not None:
+        if (self.embedding_faces is None) != (self.embedding_barycentric is None):
+            raise InputError("Garment.embedding_faces, embedding_barycentric: expected both or neither, found one")
+        if self.embedding_faces is not None and self.embedding_barycentric is not None:
             _require_array("Garment", "embedding_faces", self.embedding_faces, (verts,), np.int32)
             _require_indices("Garment", "embedding_faces", self.embedding_faces, 2**31)
             _require_array("Garment", "embedding_barycentric", self.embedding_barycentric, (verts, 3), np.float32)

@@ -26,7 +26,7 @@ from capture4d.body.anny import load_anny
 from capture4d.colours.spaces import Colour, format_colour, parse_colour
 from capture4d.errors import InputError
 from capture4d.files.atomic import content_digest, file_digest, parse_json, write_json
-from capture4d.files.reading import one_line, shortened
+from capture4d.files.reading import one_line, require_file, shortened
 from capture4d.files.records import (
     load_body,
     load_garment,
@@ -332,6 +332,7 @@ def capture_digest(capture: Capture, *, instead: Mapping[int, str] | None = None
 
 def scan_digest(path: Path) -> str:
     """Digest of a scan or its texture: name, size, first and last 64 kB, for takes are too large to be read twice."""
+    require_file(path, "scan")
     size = path.stat().st_size
     with path.open("rb") as file:
         total = hashlib.sha256(f"{path.name} {size}\n".encode() + file.read(_END))

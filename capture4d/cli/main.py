@@ -49,6 +49,9 @@ _DISK_ANSWERS = {
     errno.EROFS,
 }
 
+_ALLOW_OUTSIDE = "CAPTURE4D_ALLOW_OUTSIDE"
+"""As `capture4d.files.reading` knows it, which loads more than the command line should."""
+
 COMMANDS: Mapping[str, Any] = {
     "demo": Demo,
     "synth": Synth,
@@ -162,7 +165,9 @@ def _dispatch(arguments: list[str]) -> int:
         near = difflib.get_close_matches(name, COMMANDS, n=1)
         hint = f"; did you mean '{near[0]}'?" if near else ""
         return _complain(f"unknown command '{name}'{hint} (see capture4d --help)", code=BAD_COMMAND_LINE)
-    return _parse(name, rest)()
+    command = _parse(name, rest)
+    with _allowing(command):
+        return command()
 
 
 def _parse(name: str, arguments: list[str]) -> Any:
@@ -187,6 +192,21 @@ def _parse(name: str, arguments: list[str]) -> Any:
         parsed = tyro.cli(command, prog=f"capture4d {name}", args=arguments, default=default)
     check_command(parsed, faults, arguments)
     return parsed
+
+
+@contextlib.contextmanager
+def _allowing(command: Any) -> Iterator[None]:
+    """What a command allows its readers is told by the environment, which worker processes inherit."""
+    before = os.environ.get(_ALLOW_OUTSIDE)
+    if getattr(command, "allow_outside", False):
+        os.environ[_ALLOW_OUTSIDE] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            os.environ.pop(_ALLOW_OUTSIDE, None)
+        else:
+            os.environ[_ALLOW_OUTSIDE] = before
 
 
 def _value_of(option: str, arguments: list[str]) -> str | None:

@@ -146,13 +146,12 @@ def read_json_lines(path: str | Path) -> list[dict[str, Any]]:
     """Read a file with a JSON object a line; whatever is wrong with it is an InputError that names it and the line."""
     path = Path(path)
     rows = []
-    with reading(path, "JSON file"):
-        with path.open(encoding="utf-8-sig") as lines:
-            for number, line in enumerate(lines, start=1):
-                try:
-                    rows.append(_json_object(line))
-                except InputError as error:
-                    raise InputError(f"line {number}: {error.reason}") from None
+    with reading(path, "JSON file"), path.open(encoding="utf-8-sig") as lines:
+        for number, line in enumerate(lines, start=1):
+            try:
+                rows.append(_json_object(line))
+            except InputError as error:
+                raise InputError(f"line {number}: {error.reason}") from None
     return rows
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -109,7 +108,7 @@ def texts(value: Any, name: str) -> tuple[str, ...]:
     return tuple(text(each, name) for each in _listed(value, name))
 
 
-def _listed(value: Any, name: str) -> Iterable[Any] | Any:
+def _listed(value: Any, name: str) -> list[Any]:
     if not isinstance(value, list):
         raise InputError(f"{name}: expected a list, found {_told(value)}")
     return value

@@ -14,9 +14,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from capture4d.errors import InputError
-from capture4d.files.tensors import read_tensors, write_tensors
 from capture4d.files.json_values import text, whole
 from capture4d.files.reading import reading
+from capture4d.files.tensors import read_tensors, write_tensors
 from capture4d.learning.checkpoints import filled
 from capture4d.types import Mesh
 from wrinkles.normal_maps.config import MapConfig, NetworkConfig

@@ -14,9 +14,9 @@ from jaxtyping import Int
 
 from capture4d.errors import InputError
 from capture4d.files.atomic import read_json
-from capture4d.files.tensors import read_tensors, write_tensors
 from capture4d.files.json_values import whole, wholes
 from capture4d.files.reading import reading, shortened
+from capture4d.files.tensors import read_tensors, write_tensors
 from capture4d.learning.checkpoints import filled
 from capture4d.learning.networks import ImageDecoder
 from capture4d.runs.stage import complete_record
