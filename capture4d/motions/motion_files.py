@@ -36,6 +36,8 @@ BVH_METRE = 100.0
 """Units of a written BVH in a metre."""
 AMASS_JOINTS = 52
 """SMPL-H: 22 of the body, 15 for each hand."""
+MOST_FRAMES = 1_000_000
+"""Of a resampled motion: two hours at 120 a second; a rate in a file may ask for more than memory holds."""
 FRAME_RATES = ("mocap_framerate", "mocap_frame_rate")
 Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """Turns AMASS's world, Z up, into ours."""
@@ -77,6 +79,8 @@ def write_motion(path: Path, body: Body, poses: PoseSequence, *, amass: bool = F
 def resample(poses: PoseSequence, fps: float) -> PoseSequence:
     """Poses at another frame rate, by spherical interpolation; frames are counted from 0."""
     times = (poses.frame_ids - poses.frame_ids[0]) / poses.fps
+    if times[-1] * fps > MOST_FRAMES:
+        raise InputError(f"expected at most {MOST_FRAMES} poses at {fps:g} fps, found {times[-1] * fps:.3g}")
     at = np.arange(0, times[-1] + 0.1 / fps, 1 / fps).clip(max=times[-1])
     if len(times) == 1:
         return replace(poses, frame_ids=np.zeros(1, np.int32), fps=fps)
