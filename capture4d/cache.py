@@ -22,12 +22,16 @@ def cache_path() -> Path:
     if override:
         return Path(override)
     usual = usual_cache_path()
-    return usual if usual.is_absolute() and can_write(usual) else _temporary_path()
+    return usual if usual is not None and can_write(usual) else _temporary_path()
 
 
-def usual_cache_path() -> Path:
-    """Where it is on a machine with a home."""
-    return Path(platformdirs.user_cache_dir("capture4d", appauthor=False))
+def usual_cache_path() -> Path | None:
+    """Where it is for a user with a home; None for one without."""
+    try:
+        usual = Path(platformdirs.user_cache_dir("capture4d", appauthor=False))
+    except RuntimeError:  # neither HOME nor an entry among the users
+        return None
+    return usual if usual.is_absolute() else None
 
 
 def user_cache_folder() -> Path:
