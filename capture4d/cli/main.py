@@ -15,6 +15,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, NoReturn
 
 import tyro
@@ -79,6 +80,9 @@ COMMANDS: Mapping[str, Any] = {
     "convert-poses": ConvertPoses,
     "doctor": Doctor,
 }
+
+_WRITE_FILES = (Template, RegisterMesh, Calibrate, ConvertBody, ConvertPoses, ConvertRig)
+"""Commands whose output is a file among others; that of the rest is a folder of their own."""
 
 _PRESETS: Mapping[Any, Mapping[str, Any]] = {
     Synth: synth_config.PRESETS,
@@ -166,7 +170,7 @@ def _dispatch(arguments: list[str]) -> int:
         hint = f"; did you mean '{near[0]}'?" if near else ""
         return _complain(f"unknown command '{name}'{hint} (see capture4d --help)", code=BAD_COMMAND_LINE)
     command = _parse(name, rest)
-    with _allowing(command):
+    with _allowing(command), _alone(command):
         return command()
 
 
@@ -192,6 +196,30 @@ def _parse(name: str, arguments: list[str]) -> Any:
         parsed = tyro.cli(command, prog=f"capture4d {name}", args=arguments, default=default)
     check_command(parsed, faults, arguments)
     return parsed
+
+
+@contextlib.contextmanager
+def _alone(command: Any) -> Iterator[None]:
+    """No other command writes to the same place meanwhile."""
+    output = _written_by(command)
+    if output is None:
+        yield
+        return
+    from capture4d.runs.locks import alone
+
+    folder = not isinstance(command, _WRITE_FILES)
+    with alone(output, folder=folder, wait=getattr(command, "wait", False)):
+        yield
+
+
+def _written_by(command: Any) -> Path | None:
+    """The folder, or the file, that a command writes to; None if it writes nothing."""
+    if isinstance(command, Report):
+        return command.work / "report" if command.work.is_dir() else None
+    if isinstance(command, Fit) and command.output is None:
+        return command.works[0] if command.works and command.works[0].is_dir() else None
+    work = getattr(command, "work", None)
+    return getattr(command, "output", None) or (work if work is not None and work.is_dir() else None)
 
 
 @contextlib.contextmanager

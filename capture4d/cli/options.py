@@ -35,6 +35,8 @@ class StageOptions:
     """Processes to use; the result does not depend on it."""
     overwrite: bool = False
     """Start clean: delete what an earlier run left in the output folder."""
+    wait: bool = False
+    """Wait for another command that is writing to the same folder, instead of refusing."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,6 +22,7 @@ from capture4d.errors import InputError, StaleError
 from capture4d.files.atomic import TEMPORARY_SUFFIX, file_digest, plain_value, read_json, write_json
 from capture4d.files.json_values import entry, text, whole
 from capture4d.files.reading import reading
+from capture4d.runs.locks import LOCK
 
 __all__ = [
     "SCHEMAS",
@@ -286,14 +287,16 @@ def _short(value: Any) -> str:
 
 def _is_blank(folder: Path) -> bool:
     """Nothing in it but folders and the temporary files of a run that was killed before its first file."""
-    return not any(path.is_file() and path.suffix != TEMPORARY_SUFFIX for path in folder.rglob("*"))
+    return not any(
+        path.is_file() and path.suffix != TEMPORARY_SUFFIX and path.name != LOCK for path in folder.rglob("*")
+    )
 
 
 def _discard(folder: Path, record: dict[str, Any]) -> None:
     """Empty a stage folder; if that is interrupted, the record left behind says to go on."""
     write_json(folder / "stage.json", {**record, "status": "discarded"})
     for path in folder.iterdir():
-        if path.name == "stage.json":
+        if path.name in ("stage.json", LOCK):
             continue
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
