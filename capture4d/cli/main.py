@@ -30,6 +30,7 @@ from capture4d.cli.stages import Extract, Register, Report, Run, Track
 from capture4d.cli.synthesis import Demo, Scan, Synth, SynthBoard
 from capture4d.cli.wrinkles import Compare, WrinklesApply, WrinklesMaps, WrinklesOffsets, WrinklesTrain
 from capture4d.errors import CommandLineError, InputError
+from capture4d.runs.address_space import memory_fault, require_address_space
 from capture4d.settings import gathered_faults
 from data_synth import config as synth_config
 from registration import config as registration_config
@@ -144,6 +145,11 @@ def _run(arguments: list[str]) -> int:
         if not isinstance(error, WorkerDied):
             raise
         return _complain(str(error))
+    except (MemoryError, ImportError) as error:
+        said = memory_fault(error)
+        if said is None:
+            raise
+        return _complain(said)
     except KeyboardInterrupt:
         return _complain("interrupted; finished frames are kept, the same command goes on", code=INTERRUPTED)
     except _TerminatedError:
@@ -170,6 +176,7 @@ def _dispatch(arguments: list[str]) -> int:
         hint = f"; did you mean '{near[0]}'?" if near else ""
         return _complain(f"unknown command '{name}'{hint} (see capture4d --help)", code=BAD_COMMAND_LINE)
     command = _parse(name, rest)
+    require_address_space(name)
     with _allowing(command), _alone(command):
         return command()
 
