@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -11,7 +10,6 @@ from capture4d.errors import InputError
 from capture4d.files.arrays import ArrayFile, mesh_arrays
 from capture4d.files.atomic import read_json, write_json, write_npz
 from capture4d.files.border_loops import on_open_edges
-from capture4d.files.json_values import entry, numbers, text, whole
 from capture4d.files.reading import reading
 from capture4d.types import Body, Garment, PoseSequence, Rig
 
@@ -119,24 +117,18 @@ def save_rig(path: str | Path, rig: Rig) -> None:
 def load_rig(path: str | Path) -> Rig:
     found = read_json(path, expected="a JSON object with cameras")
     with reading(path, "rig"):
-        cameras = entry(found, "cameras")
-        if not isinstance(cameras, list) or not cameras:
-            raise InputError("expected a list of at least one camera, found none")
-        rows = [_camera(index, camera) for index, camera in enumerate(cameras)]
-        return Rig(
-            names=tuple(name for name, _, _ in rows),
-            intrinsics=np.array([values["intrinsics"] for _, values, _ in rows]),
-            distortion=np.array([values["distortion"] for _, values, _ in rows]),
-            T_camera_world=np.array([values["T_camera_world"] for _, values, _ in rows]),
-            image_sizes=np.array([size for _, _, size in rows], np.int32),
-        )
-
-
-def _camera(index: int, camera: Any) -> tuple[str, dict[str, np.ndarray], list[int]]:
-    shapes = {"intrinsics": (3, 3), "distortion": (5,), "T_camera_world": (4, 4)}
-    try:
-        values = {name: numbers(entry(camera, name), shape, name) for name, shape in shapes.items()}
-        size = [whole(entry(camera, side), side, least=1) for side in ("width", "height")]
-        return text(entry(camera, "name"), "name"), values, size
-    except InputError as error:
-        raise InputError(f"cameras[{index}]: {error.reason}") from None
+        if "cameras" not in found:
+            raise InputError("expected the entry 'cameras', found none")
+        cameras = found["cameras"]
+        if not cameras:
+            raise InputError("expected at least one camera, found none")
+        try:
+            return Rig(
+                names=tuple(str(camera["name"]) for camera in cameras),
+                intrinsics=np.array([camera["intrinsics"] for camera in cameras], np.float64),
+                distortion=np.array([camera["distortion"] for camera in cameras], np.float64),
+                T_camera_world=np.array([camera["T_camera_world"] for camera in cameras], np.float64),
+                image_sizes=np.array([[camera["width"], camera["height"]] for camera in cameras], np.int32),
+            )
+        except KeyError as error:
+            raise InputError(f"expected the entry {error} for every camera, found none") from None

@@ -20,6 +20,7 @@ from jaxtyping import Float, Float32
 from torch import Tensor, nn
 
 from capture4d.errors import InputError
+from capture4d.files.reading import one_line
 from capture4d.learning.checkpoints import filled
 from capture4d.settings import SettingError
 from retarget.config import LstmConfig
@@ -169,7 +170,7 @@ def load_lstm(
     try:
         config = LstmConfig(**file.entry("lstm"))
     except TypeError as error:
-        raise InputError(f"expected the settings of an LSTM, found others ({error})", where=path) from None
+        raise InputError(f"expected the settings of an LSTM, found others ({one_line(error)})", where=path) from None
     except SettingError as fault:
         raise fault.at(path) from None
     placed = usable_device(device)

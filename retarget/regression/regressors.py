@@ -286,7 +286,13 @@ def read_regressor(path: Path, kind: str, *, model_digest: str) -> tuple[TensorF
             raise InputError(f"'{name}': expected floats in rows, found {array.dtype} of {array.shape}", where=path)
         if not np.isfinite(array).all():
             raise InputError(f"expected finite numbers, found NaN or inf in '{name}'", where=path)
-    return file, _load_layout(file), Scales(file["control_mean"], file["control_std"], file["coefficient_std"])
+    layout = _load_layout(file)
+    with reading(path, "regressor"):
+        names = ("control_mean", "control_std", "coefficient_std")
+        if any(file[name].ndim != 1 for name in names) or len(file[names[0]]) != len(file[names[1]]):
+            found = ", ".join(str(file[name].shape) for name in names)
+            raise InputError(f"expected scales in one row each, the first two as long as each other, found {found}")
+        return file, layout, Scales(*(file[name].astype(np.float32) for name in names))
 
 
 def _load_layout(file: TensorFile) -> ControlLayout:

@@ -15,7 +15,7 @@ from torch.nn import functional
 
 from capture4d.errors import InputError
 from capture4d.files.json_values import text, whole
-from capture4d.files.reading import reading
+from capture4d.files.reading import one_line, reading
 from capture4d.files.tensors import read_tensors, write_tensors
 from capture4d.learning.checkpoints import filled
 from capture4d.types import Mesh
@@ -136,7 +136,8 @@ def load_model(path: str | PathLike[str]) -> WrinkleModel:
     try:
         config, maps = NetworkConfig(**file.entry("network")), MapConfig(**file.entry("maps"))
     except (TypeError, ValueError) as error:
-        raise InputError(f"expected the settings of a wrinkle generator, found others ({error})", where=path) from None
+        said = f"expected the settings of a wrinkle generator, found others ({one_line(error)})"
+        raise InputError(said, where=path) from None
     own = (VERTICES, FACES, UV)
     weights = {name: torch.from_numpy(each) for name, each in file.tensors.items() if name not in own}
     with reading(path, "wrinkle generator"):

@@ -83,7 +83,7 @@ def load_offset_model(path: Path) -> OffsetModel:
         texels = whole(file.entry("texels"), "texels", least=8)
         if kind not in NETWORKS:
             raise InputError(f"expected a network called {' or '.join(NETWORKS)}, found {shortened(str(kind), 80)}")
-        if not isinstance(history, list):
+        if not isinstance(history, list) or not all(isinstance(epoch, dict) for epoch in history):
             raise InputError("history: expected a list of epochs, found something else")
         make = partial(image_decoder, 9 * len(joints), texels)
         if kind == BASELINE:

@@ -114,8 +114,8 @@ def broken_rigs(folder: Path) -> dict[str, str]:
     lost["cameras"][0]["intrinsics"][0][2] = float("nan")
     return {
         "not valid JSON": json.dumps(good)[:-40],
-        "cameras[1]: expected the entry 'intrinsics', found none": json.dumps(without),
-        "T_camera_world: expected 4 entries, found 2": json.dumps(bent),
+        "expected the entry 'intrinsics' for every camera, found none": json.dumps(without),
+        "inhomogeneous shape": json.dumps(bent),
         "expected finite numbers, found NaN": json.dumps(lost),
         "expected the entry 'cameras'": json.dumps({"rig": []}),
         "expected a JSON object": "[]",
