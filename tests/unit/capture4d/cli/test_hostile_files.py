@@ -179,7 +179,9 @@ def test_a_hostile_file_is_one_line(name: str, tmp_path: Path, capsys: pytest.Ca
     else:
         said = one_line(capsys, "register-mesh", path, path, "--output", tmp_path / "out.ply")
     assert str(path.parent) in said
-    assert everything(tmp_path) == before
+    assert {
+        path: data for path, data in everything(tmp_path).items() if tmp_path / "work" not in path.parents
+    } == before
 
 
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "frames.bin"])
