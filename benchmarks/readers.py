@@ -54,7 +54,7 @@ def run(
             for outcome in read_apart(Reading(now, count, kind)):
                 outcomes[outcome.found] += 1
                 if outcome.found in FAULTS:
-                    _keep(failures / f"{outcome.mutant.name.replace('/', '-')}-{now}-{outcome.mutant.number}", outcome,
+                    keep(failures / f"{outcome.mutant.name.replace('/', '-')}-{now}-{outcome.mutant.number}", outcome,
                           console)  # fmt: skip
         except KeyboardInterrupt:
             break
@@ -70,7 +70,7 @@ def run(
     ]
 
 
-def _keep(folder: Path, outcome: Outcome, console: Console) -> None:
+def keep(folder: Path, outcome: Outcome, console: Console) -> None:
     """Write a mutant down, with what it did and how it is read again."""
     for name, data in outcome.mutant.files().items():
         (folder / "files" / name).parent.mkdir(parents=True, exist_ok=True)
