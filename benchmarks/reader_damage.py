@@ -176,7 +176,7 @@ def _array(chance: random.Random, data: bytes) -> tuple[str, bytes]:
         flat = arrays[name].copy().reshape(-1)
         for _ in range(chance.randrange(1, 4)):
             if flat.size and flat.dtype.kind in "iuf":
-                flat[chance.randrange(flat.size)] = chance.choice((-1, 0, 1, 2, 7, 100))
+                flat[chance.randrange(flat.size)] = np.array(chance.choice((-1, 0, 1, 2, 7, 100))).astype(flat.dtype)
         return f"entries of {name}", with_arrays(data, {name: flat.reshape(arrays[name].shape)})
     return f"{name}: {change}", with_arrays(data, {name: ARRAY_CHANGES[change](arrays[name])})
 

@@ -7,6 +7,7 @@ them all.
 from __future__ import annotations
 
 import contextlib
+import importlib
 import io
 import pickle
 import tempfile
@@ -97,8 +98,9 @@ def _textured_glb(path: Path) -> None:
 
     model: Any = trimesh.Trimesh(MESH.vertices, MESH.faces, process=False)
     picture = Image.fromarray(RNG.integers(0, 256, (4, 4, 3), np.uint8))
-    material = trimesh.visual.material.PBRMaterial(baseColorTexture=picture)
-    model.visual = trimesh.visual.TextureVisuals(RNG.random((6, 2)), material=material)
+    visual: Any = importlib.import_module("trimesh.visual")
+    material = visual.material.PBRMaterial(baseColorTexture=picture)
+    model.visual = visual.TextureVisuals(RNG.random((6, 2)), material=material)
     data = trimesh.Scene(model).export(file_type="glb")
     assert isinstance(data, bytes)
     path.write_bytes(data)

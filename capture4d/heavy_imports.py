@@ -66,12 +66,12 @@ def njit(**options: Any) -> Callable[[Any], Any]:
 
 @functools.cache
 def _import_numba() -> Any:
-    numba = importlib.import_module("numba")
+    numba: Any = importlib.import_module("numba")
     folder = kernel_cache()
     if folder is not None and not os.environ.get("NUMBA_CACHE_DIR"):
         with contextlib.suppress(OSError):  # without it nothing is kept
             user_cache_folder()
-        importlib.import_module("numba.core.config").CACHE_DIR = str(folder)
+        numba.core.config.CACHE_DIR = str(folder)
     return numba
 
 
