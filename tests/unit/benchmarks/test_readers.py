@@ -48,25 +48,22 @@ kinds.BY_NAME.update({kind.name: kind for kind in kinds.KINDS})
 worker.CPU_S = 0.3
 
 if __name__ == "__main__":
-    for outcome in worker.read_apart(worker.Reading(0, 10)):
+    for outcome in worker.read_apart(worker.Reading(0, 5)):
         print(outcome.mutant.name, outcome.found)
 """
 
 
+@pytest.mark.slow
 def test_readers_that_crash_hang_or_take_too_much_are_told_apart(tmp_path: Path) -> None:
     (tmp_path / "script.py").write_text(SCRIPT)
     done = subprocess.run([sys.executable, str(tmp_path / "script.py")], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     found = [tuple(line.split()) for line in done.stdout.splitlines()]
-    assert len(found) == 10  # every mutant has an outcome, also those after a death
-    noticed = {
-        ("crash.json", "crash"),
-        ("hang.json", "hang"),
-        ("greedy.json", "memory"),
-        ("careless.json", "traceback"),
-    }
-    assert noticed | {("good.json", "value")} <= set(found)
-    assert {said for _, said in set(found) - noticed} == {"value"}  # damage that changed nothing
+    assert len(found) == 5  # every mutant has an outcome, also those after a death
+    assert set(found) == {
+        ("crash.json", "crash"), ("hang.json", "hang"), ("greedy.json", "memory"), ("careless.json", "traceback"),
+        ("good.json", "value"),
+    }  # fmt: skip
 
 
 @pytest.fixture
