@@ -12,10 +12,10 @@ Fault = TypeVar("Fault", bound="InputError")
 class InputError(ValueError):
     """Bad data from outside: a file, a frame, an argument.
 
-    The message is one line, whatever a file held, that names the file, frame or argument, says what was expected, and what was found. The
-    command line prints it without a traceback and exits with 1. What the system answers about a file that is there (no
-    permission, a full disk) stays an OSError, which it prints likewise; every other exception is our own bug and keeps
-    its traceback.
+    The message is one line, whatever a file held, that names the file, frame or argument, says what was expected, and
+    what was found. The command line prints it without a traceback and exits with 1. What the system answers about a
+    file that is there (no permission, a full disk) stays an OSError, which it prints likewise; every other exception is
+    our own bug and keeps its traceback.
 
     Attributes:
         reason: the message without the file.
