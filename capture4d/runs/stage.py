@@ -260,7 +260,7 @@ def read_record(path: Path) -> dict[str, Any]:
             )
         if record.get("status") == "complete":
             text(entry(record, "digest"), "digest")
-        for key in ("config", "upstream", "sources"):
+        for key in ("upstream", "sources"):
             if not isinstance(record.get(key, {}), dict):
                 raise InputError(f"{key}: expected an object, found {type(record[key]).__name__}")
         for key in ("upstream", "sources"):

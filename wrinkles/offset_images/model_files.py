@@ -14,7 +14,7 @@ from jaxtyping import Int
 
 from capture4d.errors import InputError
 from capture4d.files.atomic import read_json
-from capture4d.files.json_values import whole, wholes
+from capture4d.files.json_values import entry, number, whole, wholes
 from capture4d.files.reading import reading, shortened
 from capture4d.files.tensors import read_tensors, write_tensors
 from capture4d.learning.checkpoints import filled
@@ -121,7 +121,13 @@ def find_offsets(work: Path, *, registration: str) -> LearnedOffsets | None:
         return None
     command = f"capture4d wrinkles offsets {work}"
     record = complete_record(folder, STAGE, command, made_from={"registration": registration})
-    frames, config = read_json(folder / FRAMES), record["config"]
+    frames, config = read_json(folder / FRAMES), record.get("config")
     models = {name: load_offset_model(folder / f"{name}.safetensors") for name in NETWORKS}
-    seen = frozenset([*frames["learned"], *frames["chose_epoch"]])
-    return LearnedOffsets(record["digest"], config["held_out"], config["held_out_gap"], seen, models)
+    with reading(folder / FRAMES, "list of frames"):
+        seen = frozenset(frame for name in ("learned", "chose_epoch") for frame in wholes(entry(frames, name), name))
+    with reading(folder / "stage.json", "record of a stage"):
+        held_out, gap = (
+            number(entry(config, "held_out"), "held_out"),
+            whole(entry(config, "held_out_gap"), "held_out_gap"),
+        )
+    return LearnedOffsets(record["digest"], held_out, gap, seen, models)

@@ -362,7 +362,7 @@ def test_a_record_of_a_later_version_is_refused(tmp_path: Path):
 
 @pytest.mark.parametrize("changed", [
     {"stage": 3}, {"stage": "a\nb"}, {"schema": "1"}, {"schema": True}, {"digest": 7}, {"upstream": []},
-    {"upstream": {"garment": 1}}, {"config": "x"}, {"sources": {"capture": None}},
+    {"upstream": {"garment": 1}}, {"sources": {"capture": None}},
 ])  # fmt: skip
 def test_a_record_that_is_none_is_one_line(tmp_path: Path, changed: dict[str, object]):
     finish_frames(open_test_stage(tmp_path / "stage"))
