@@ -7,7 +7,7 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
-from capture4d.runs.cache import user_cache_folder
+from capture4d.cache import user_cache_folder
 from data_synth import training_set
 from data_synth.config import SynthConfig, TrainingSetConfig
 from data_synth.stage import SCHEMA, run

@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 from benchmarks.cached_takes import cached_take
 from benchmarks.renewal import renew
 from capture4d import pipeline
-from capture4d.runs.cache import user_cache_folder
+from capture4d.cache import user_cache_folder
 from data_synth.config import PRESETS, SynthConfig
 
 __all__ = ["QUICK_TAKE", "locate_texels", "registered_work"]

@@ -1,4 +1,5 @@
-"""Import open3d, warp and pycolmap where they are needed: quietly, and so that they load at all."""
+"""Import open3d, warp, pycolmap and numba where they are needed: quietly, and so that they load at all, also where
+neither the code nor the home of the user can be written to."""
 
 from __future__ import annotations
 
@@ -8,10 +9,12 @@ import functools
 import importlib
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
-__all__ = ["import_open3d", "import_pycolmap", "import_warp"]
+from capture4d.cache import cache_path, kernel_cache, user_cache_folder, usual_cache_path
+
+__all__ = ["import_open3d", "import_pycolmap", "import_warp", "njit"]
 
 
 @functools.cache
@@ -39,9 +42,37 @@ def import_warp() -> Any:
     with _native_stderr_closed():  # on a machine without CUDA its library prints a warning that nothing switches off
         import warp
 
+        if "WARP_CACHE_PATH" not in os.environ and cache_path() != usual_cache_path():
+            warp.config.kernel_cache_dir = str(user_cache_folder() / "warp")
         warp.config.log_level = warp.LOG_ERROR  # or it prints each device and each compiled module
         warp.init()
     return warp
+
+
+def njit(**options: Any) -> Callable[[Any], Any]:
+    """numba's decorator. What it compiles is kept beside the code, else in the cache folder, else not at all."""
+    numba = _import_numba()
+
+    def compiled(function: Any) -> Any:
+        try:
+            return numba.njit(**options)(function)
+        except RuntimeError as error:  # "no locator available": it can be kept nowhere
+            if "locator" not in str(error):
+                raise
+            return numba.njit(**{**options, "cache": False})(function)
+
+    return compiled
+
+
+@functools.cache
+def _import_numba() -> Any:
+    numba: Any = importlib.import_module("numba")
+    folder = kernel_cache()
+    if folder is not None and not os.environ.get("NUMBA_CACHE_DIR"):
+        with contextlib.suppress(OSError):  # without it nothing is kept
+            user_cache_folder()
+        numba.core.config.CACHE_DIR = str(folder)
+    return numba
 
 
 @contextlib.contextmanager

@@ -12,12 +12,23 @@ import unicodedata
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Float32, Int32, UInt8
 
-from capture4d.errors import InputError, NotFiniteError
+from capture4d.errors import InputError
+from capture4d.value_checks import (
+    require_array,
+    require_finite,
+    require_frame_rate,
+    require_frames,
+    require_indices,
+    require_loop,
+    require_names,
+    require_rotations,
+    require_weights,
+)
 
 __all__ = [
     "BlendshapeModel",
@@ -33,30 +44,6 @@ __all__ = [
 ]
 
 
-def _require_array(owner: str, name: str, value: Any, shape: tuple[int | None, ...], dtype: type) -> None:
-    if not isinstance(value, np.ndarray) or value.dtype != np.dtype(dtype):
-        found = value.dtype if isinstance(value, np.ndarray) else type(value).__name__
-        raise InputError(f"{owner}.{name}: expected an array of {np.dtype(dtype)}, found {found}")
-    fits = value.ndim == len(shape) and all(
-        want is None or want == have for want, have in zip(shape, value.shape, strict=True)
-    )
-    if not fits:
-        expected = "(" + ", ".join("*" if want is None else str(want) for want in shape) + ")"
-        raise InputError(f"{owner}.{name}: expected shape {expected}, found {value.shape}")
-
-
-def _require_finite(owner: str, name: str, value: np.ndarray) -> None:
-    if not np.isfinite(value).all():
-        bad = int(np.count_nonzero(~np.isfinite(value).reshape(len(value), -1).all(axis=1)))
-        raise NotFiniteError(f"{owner}.{name}: expected finite numbers, found NaN or inf in {bad} of {len(value)} rows")
-
-
-def _require_indices(owner: str, name: str, value: np.ndarray, count: int) -> None:
-    if value.size and (value.min() < 0 or value.max() >= count):
-        found = int(value.min()) if value.min() < 0 else int(value.max())
-        raise InputError(f"{owner}.{name}: expected indices from 0 to {count - 1}, found {found}")
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Mesh:
     """A triangle mesh, optionally with a UV per face corner."""
@@ -69,13 +56,13 @@ class Mesh:
     """Texture coordinates per face corner; garment patterns keep them in metres on the panel."""
 
     def __post_init__(self) -> None:
-        _require_array("Mesh", "vertices", self.vertices, (None, 3), np.float32)
-        _require_array("Mesh", "faces", self.faces, (None, 3), np.int32)
-        _require_finite("Mesh", "vertices", self.vertices)
-        _require_indices("Mesh", "faces", self.faces, len(self.vertices))
+        require_array("Mesh", "vertices", self.vertices, (None, 3), np.float32)
+        require_array("Mesh", "faces", self.faces, (None, 3), np.int32)
+        require_finite("Mesh", "vertices", self.vertices)
+        require_indices("Mesh", "faces", self.faces, len(self.vertices))
         if self.uv is not None:
-            _require_array("Mesh", "uv", self.uv, (len(self.faces), 3, 2), np.float32)
-            _require_finite("Mesh", "uv", self.uv)
+            require_array("Mesh", "uv", self.uv, (len(self.faces), 3, 2), np.float32)
+            require_finite("Mesh", "uv", self.uv)
 
     def with_vertices(self, vertices: Float32[np.ndarray, "verts 3"]) -> Mesh:
         """The same faces and UVs at other positions."""
@@ -107,12 +94,12 @@ class Rig:
 
     def __post_init__(self) -> None:
         count = len(self.names)
-        _require_array("Rig", "intrinsics", self.intrinsics, (count, 3, 3), np.float64)
-        _require_array("Rig", "distortion", self.distortion, (count, 5), np.float64)
-        _require_array("Rig", "T_camera_world", self.T_camera_world, (count, 4, 4), np.float64)
-        _require_array("Rig", "image_sizes", self.image_sizes, (count, 2), np.int32)
+        require_array("Rig", "intrinsics", self.intrinsics, (count, 3, 3), np.float64)
+        require_array("Rig", "distortion", self.distortion, (count, 5), np.float64)
+        require_array("Rig", "T_camera_world", self.T_camera_world, (count, 4, 4), np.float64)
+        require_array("Rig", "image_sizes", self.image_sizes, (count, 2), np.int32)
         for name in ("intrinsics", "distortion", "T_camera_world"):
-            _require_finite("Rig", name, getattr(self, name))
+            require_finite("Rig", name, getattr(self, name))
         if not self.lenses:
             object.__setattr__(self, "lenses", ("brown",) * count)
         if len(self.lenses) != count:
@@ -168,7 +155,7 @@ class Scan:
     time_s: float
 
     def __post_init__(self) -> None:
-        _require_array("Scan", "colours", self.colours, (len(self.mesh.vertices), 3), np.uint8)
+        require_array("Scan", "colours", self.colours, (len(self.mesh.vertices), 3), np.uint8)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -184,10 +171,13 @@ class GarmentScan:
     frame_id: int
 
     def __post_init__(self) -> None:
-        _require_array("GarmentScan", "boundary_points", self.boundary_points, (None, 3), np.float32)
-        _require_array("GarmentScan", "boundary_loops", self.boundary_loops, (len(self.boundary_points),), np.int32)
-        _require_finite("GarmentScan", "boundary_points", self.boundary_points)
-        _require_indices("GarmentScan", "boundary_loops", self.boundary_loops + 1, len(self.loop_names) + 1)
+        require_array("GarmentScan", "boundary_points", self.boundary_points, (None, 3), np.float32)
+        require_array("GarmentScan", "boundary_loops", self.boundary_loops, (len(self.boundary_points),), np.int32)
+        require_finite("GarmentScan", "boundary_points", self.boundary_points)
+        require_names("GarmentScan", "loop_names", self.loop_names)
+        require_indices(
+            "GarmentScan", "boundary_loops", self.boundary_loops.astype(np.int64) + 1, len(self.loop_names) + 1
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -215,20 +205,27 @@ class Body:
 
     def __post_init__(self) -> None:
         verts, joints = len(self.template.vertices), len(self.joint_names)
-        _require_array("Body", "shape_directions", self.shape_directions, (None, verts, 3), np.float32)
-        _require_array("Body", "joints", self.joints, (joints, 3), np.float32)
+        require_array("Body", "shape_directions", self.shape_directions, (None, verts, 3), np.float32)
+        require_array("Body", "joints", self.joints, (joints, 3), np.float32)
         shapes = len(self.shape_directions)
-        _require_array("Body", "joint_directions", self.joint_directions, (shapes, joints, 3), np.float32)
-        _require_array("Body", "parents", self.parents, (joints,), np.int32)
-        _require_array("Body", "skin_weights", self.skin_weights, (verts, joints), np.float32)
-        for name in ("shape_directions", "joints", "joint_directions", "skin_weights"):
-            _require_finite("Body", name, getattr(self, name))
+        require_array("Body", "joint_directions", self.joint_directions, (shapes, joints, 3), np.float32)
+        require_array("Body", "parents", self.parents, (joints,), np.int32)
+        require_array("Body", "skin_weights", self.skin_weights, (verts, joints), np.float32)
+        for name in ("shape_directions", "joints", "joint_directions"):
+            require_finite("Body", name, getattr(self, name))
+        require_names("Body", "joint_names", self.joint_names)
+        if not joints:
+            raise InputError("Body.joint_names: expected at least one joint, found none")
         if self.pose_directions is not None:
-            _require_finite("Body", "pose_directions", self.pose_directions)
+            features = 9 * (joints - 1)
+            require_array("Body", "pose_directions", self.pose_directions, (features, verts, 3), np.float32)
+            require_finite("Body", "pose_directions", self.pose_directions)
+        if self.regions is not None:
+            require_array("Body", "regions", self.regions, (verts,), np.uint8)
+            require_indices("Body", "regions", self.regions, 4)
         if self.parents[0] != -1 or (self.parents[1:] >= np.arange(1, joints)).any() or (self.parents[1:] < 0).any():
             raise InputError("Body.parents: expected joint 0 as the root and every parent before its children")
-        if np.abs(self.skin_weights.sum(axis=1) - 1).max(initial=0) > 1e-3:
-            raise InputError("Body.skin_weights: expected rows that sum to 1")
+        require_weights("Body", "skin_weights", self.skin_weights)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -249,17 +246,17 @@ class PoseSequence:
 
     def __post_init__(self) -> None:
         frames, joints = len(self.frame_ids), len(self.joint_names)
-        _require_array("PoseSequence", "rotations", self.rotations, (frames, joints, 3, 3), np.float32)
-        _require_array("PoseSequence", "translations", self.translations, (frames, 3), np.float32)
-        _require_array("PoseSequence", "shape", self.shape, (None,), np.float32)
-        _require_array("PoseSequence", "frame_ids", self.frame_ids, (frames,), np.int32)
-        _require_finite("PoseSequence", "rotations", self.rotations)
-        _require_finite("PoseSequence", "translations", self.translations)
-        _require_finite("PoseSequence", "shape", self.shape)
-        if not self.fps > 0:
-            raise InputError(f"PoseSequence.fps: expected a positive frame rate, found {self.fps}")
-        if len(np.unique(self.frame_ids)) != frames:
-            raise InputError("PoseSequence.frame_ids: expected every frame once, found duplicates")
+        require_array("PoseSequence", "rotations", self.rotations, (frames, joints, 3, 3), np.float32)
+        require_array("PoseSequence", "translations", self.translations, (frames, 3), np.float32)
+        require_array("PoseSequence", "shape", self.shape, (None,), np.float32)
+        require_array("PoseSequence", "frame_ids", self.frame_ids, (frames,), np.int32)
+        require_finite("PoseSequence", "rotations", self.rotations)
+        require_finite("PoseSequence", "translations", self.translations)
+        require_finite("PoseSequence", "shape", self.shape)
+        require_rotations("PoseSequence", "rotations", self.rotations)
+        require_names("PoseSequence", "joint_names", self.joint_names)
+        require_frame_rate("PoseSequence.fps", self.fps)
+        require_frames("PoseSequence", self.frame_ids)
 
     def row(self, frame_id: int) -> int:
         """Where a frame's pose is.
@@ -308,19 +305,22 @@ class Garment:
     def __post_init__(self) -> None:
         verts = len(self.template.vertices)
         for name, loop in self.loops.items():
-            _require_array("Garment", f"loops[{name!r}]", loop, (None,), np.int32)
-            _require_indices("Garment", f"loops[{name!r}]", loop, verts)
-        if self.embedding_faces is not None:
-            _require_array("Garment", "embedding_faces", self.embedding_faces, (verts,), np.int32)
-            _require_array("Garment", "embedding_barycentric", self.embedding_barycentric, (verts, 3), np.float32)
+            require_array("Garment", f"loops[{name!r}]", loop, (None,), np.int32)
+            require_indices("Garment", f"loops[{name!r}]", loop, verts)
+            require_loop(name, loop)
+        if (self.embedding_faces is None) != (self.embedding_barycentric is None):
+            raise InputError("Garment.embedding_faces, embedding_barycentric: expected both or neither, found one")
+        if self.embedding_faces is not None and self.embedding_barycentric is not None:
+            require_array("Garment", "embedding_faces", self.embedding_faces, (verts,), np.int32)
+            require_indices("Garment", "embedding_faces", self.embedding_faces, 2**31)
+            require_array("Garment", "embedding_barycentric", self.embedding_barycentric, (verts, 3), np.float32)
+            require_weights("Garment", "embedding_barycentric", self.embedding_barycentric)
         if self.body_shape is not None:
-            _require_array("Garment", "body_shape", self.body_shape, (None,), np.float32)
-            _require_finite("Garment", "body_shape", self.body_shape)
+            require_array("Garment", "body_shape", self.body_shape, (None,), np.float32)
+            require_finite("Garment", "body_shape", self.body_shape)
         if self.skin_weights is not None:
-            _require_array("Garment", "skin_weights", self.skin_weights, (verts, None), np.float32)
-            _require_finite("Garment", "skin_weights", self.skin_weights)
-            if np.abs(self.skin_weights.sum(axis=1) - 1).max(initial=0) > 1e-3:
-                raise InputError("Garment.skin_weights: expected rows that sum to 1")
+            require_array("Garment", "skin_weights", self.skin_weights, (verts, None), np.float32)
+            require_weights("Garment", "skin_weights", self.skin_weights)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -335,10 +335,11 @@ class RegisteredSequence:
 
     def __post_init__(self) -> None:
         frames, verts = len(self.frame_ids), len(self.garment.template.vertices)
-        _require_array("RegisteredSequence", "vertices", self.vertices, (frames, verts, 3), np.float32)
-        _require_array("RegisteredSequence", "residual_m", self.residual_m, (frames, verts), np.float32)
-        _require_array("RegisteredSequence", "frame_ids", self.frame_ids, (frames,), np.int32)
-        _require_finite("RegisteredSequence", "vertices", self.vertices)
+        require_array("RegisteredSequence", "vertices", self.vertices, (frames, verts, 3), np.float32)
+        require_array("RegisteredSequence", "residual_m", self.residual_m, (frames, verts), np.float32)
+        require_array("RegisteredSequence", "frame_ids", self.frame_ids, (frames,), np.int32)
+        require_finite("RegisteredSequence", "vertices", self.vertices)
+        require_frames("RegisteredSequence", self.frame_ids)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -366,16 +367,18 @@ class BlendshapeModel:
 
     def __post_init__(self) -> None:
         verts, shapes = len(self.garment.template.vertices), len(self.std)
-        _require_array("BlendshapeModel", "mean", self.mean, (verts, 3), np.float32)
-        _require_array("BlendshapeModel", "basis", self.basis, (shapes, verts, 3), np.float32)
-        _require_array("BlendshapeModel", "std", self.std, (shapes,), np.float32)
+        require_array("BlendshapeModel", "mean", self.mean, (verts, 3), np.float32)
+        require_array("BlendshapeModel", "basis", self.basis, (shapes, verts, 3), np.float32)
+        require_array("BlendshapeModel", "std", self.std, (shapes,), np.float32)
         for name in ("mean", "basis", "std"):
-            _require_finite("BlendshapeModel", name, getattr(self, name))
+            require_finite("BlendshapeModel", name, getattr(self, name))
+        if self.std.min(initial=0) < 0:
+            raise InputError(f"BlendshapeModel.std: expected no negative deviation, found {self.std.min():.4g}")
+        require_names("BlendshapeModel", "joint_names", self.joint_names)
         weights = self.garment.skin_weights
         if weights is None or weights.shape[1] != len(self.joint_names):
             found = "none" if weights is None else f"weights for {weights.shape[1]}"
             raise InputError(
                 f"BlendshapeModel: expected skin weights for {len(self.joint_names)} joints, found {found}"
             )
-        if not self.fps > 0:
-            raise InputError(f"BlendshapeModel.fps: expected a positive frame rate, found {self.fps}")
+        require_frame_rate("BlendshapeModel.fps", self.fps)

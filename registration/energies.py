@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float64, Int32
-from numba import njit
 
+from capture4d.heavy_imports import njit
 from registration.solver import BlockTerm
 
 __all__ = ["plane_metric", "rigid_term", "stretch_metric", "tangential_metric"]

@@ -15,10 +15,10 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float64, Int32
-from numba import njit
 
 from capture4d.geometry.mesh import edges_of_faces
 from capture4d.geometry.point_grid import PointGrid
+from capture4d.heavy_imports import njit
 from registration.correspondences import ScanSurface
 
 __all__ = ["edge_faces", "folded_lengths"]

@@ -19,7 +19,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64, Int32
-from numba import njit
+
+from capture4d.heavy_imports import njit
 
 __all__ = ["BlockTerm", "RowTerm", "Rows", "add_block_diagonal", "gauss_newton_step", "rows_product", "rows_transpose"]
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from capture4d.errors import InputError
 from capture4d.files.atomic import file_digest, read_json
+from capture4d.runs.stage import read_record
 from retarget.regression.splits import Piece
 
 __all__ = [
@@ -49,7 +50,7 @@ def learned_frames(folder: Path, registration: str) -> list[range]:
     Raises:
         InputError: files of the model are missing or damaged.
     """
-    taken = read_json(folder / "stage.json").get("upstream", {})
+    taken = read_record(folder / "stage.json").get("upstream", {})
     names = [name for name, digest in taken.items() if digest == registration]
     try:
         split = read_json(folder / "fit.json")["split"]

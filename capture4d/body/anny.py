@@ -22,10 +22,10 @@ from typing import Any
 
 import numpy as np
 
+from capture4d.cache import user_cache_folder
 from capture4d.files.records import load_body, save_body
 from capture4d.geometry.mesh import connected_components, face_areas
 from capture4d.heavy_imports import import_warp
-from capture4d.runs.cache import user_cache_folder
 from capture4d.types import Body, Mesh
 
 __all__ = ["load_anny"]

@@ -19,7 +19,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int32
-from numba import njit
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
@@ -27,6 +26,7 @@ from capture4d.body.skinning import PosedBody, with_pose, with_shape
 from capture4d.geometry.mesh import face_areas
 from capture4d.geometry.mesh_kernels import vertex_normals_kernel
 from capture4d.geometry.triangles import closest_on_faces
+from capture4d.heavy_imports import njit
 from capture4d.types import Body
 
 __all__ = ["BodyState", "Matches", "PosedSurface", "TrackedBody", "linearise", "match", "pose_surface", "tracked_body"]

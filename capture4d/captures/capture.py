@@ -337,10 +337,12 @@ def capture_digest(capture: Capture, *, instead: Mapping[int, str] | None = None
 def scan_digest(path: Path) -> str:
     """Digest of a scan or its texture: name, size, first and last 64 kB, for takes are too large to be read twice.
 
-    Of a file that cannot be opened, name and size alone: that is a fault of its frame, not of the take.
+    Of what cannot be opened, or is no file, name and size alone: that is a fault of its frame, not of the take.
     """
     size = path.stat().st_size
     total = hashlib.sha256(f"{path.name} {size}\n".encode("utf-8", "surrogateescape"))
+    if not path.is_file():  # a pipe would wait for its writer
+        return total.hexdigest()
     with contextlib.suppress(OSError), path.open("rb") as file:
         ends = file.read(_END)
         file.seek(max(size - _END, _END))

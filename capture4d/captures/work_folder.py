@@ -18,13 +18,12 @@ from capture4d.captures.capture import Capture, read_capture
 from capture4d.errors import InputError, StaleError
 from capture4d.files.arrays import ArrayFile, map_array
 from capture4d.files.atomic import (
-    read_json,
     read_json_lines,
     write_npy_rows,
 )
 from capture4d.files.reading import reading
 from capture4d.files.records import load_body, load_garment, load_poses
-from capture4d.runs.stage import Stage, require_complete
+from capture4d.runs.stage import Stage, read_record, require_complete
 from capture4d.types import Body, PoseSequence, RegisteredSequence
 
 __all__ = [
@@ -161,7 +160,7 @@ class WorkFolder:
 def open_work(path: str | Path) -> WorkFolder:
     """Open a work folder, finished or not; what is missing is told when it is asked for."""
     path = Path(path)
-    records = {file.parent.name: read_json(file) for file in sorted(path.glob("*/stage.json"))}
+    records = {file.parent.name: read_record(file) for file in sorted(path.glob("*/stage.json"))}
     return WorkFolder(path, records)
 
 
@@ -190,7 +189,11 @@ def load_registration(folder: Path) -> RegisteredSequence:
     residual = []
     for frame_id in frame_ids:
         with ArrayFile(folder / "frames" / f"{frame_id:06d}.npz") as arrays:
-            residual.append(arrays["residual_m"])
+            found = arrays["residual_m"]
+            if found.dtype != np.float32 or found.shape != garment.template.vertices.shape[:1]:
+                expected = f"{len(garment.template.vertices)} residuals as float32"
+                raise InputError(f"expected {expected}, found {found.dtype} of shape {found.shape}")
+            residual.append(found)
     path = folder / "vertices.npy"
     vertices = map_array(
         path,

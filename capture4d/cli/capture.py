@@ -11,14 +11,14 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from capture4d.calibration.config import CalibrationConfig, RigCheckConfig
 from capture4d.cli.exit_codes import BAD_RESULT, GOOD
-from capture4d.cli.options import all_cores
+from capture4d.cli.options import MeshOptions, all_cores
 from capture4d.settings import Count, Positive
 
 __all__ = ["Calibrate", "Check", "CheckRig"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Check:
+class Check(MeshOptions):
     """Look through a take before a night is spent on it; exit code 3 if it has errors."""
 
     capture: Annotated[Positional[Path], arg(metavar="CAPTURE")]

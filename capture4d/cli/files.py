@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from capture4d.cli.exit_codes import BAD_RESULT, GOOD
+from capture4d.cli.options import MeshOptions
 from capture4d.settings import Positive, Whole
 from capture4d.templates.config import Region, TemplateConfig, UvChoice
 from registration.config import MeshRegistrationConfig
@@ -20,7 +21,7 @@ Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Template:
+class Template(MeshOptions):
     """Make a template of your own garment mesh, or of a part of the body: bound, its borders named, its UVs checked."""
 
     mesh: Annotated[Positional[Path | None], arg(metavar="MESH")] = None
@@ -61,7 +62,7 @@ class Template:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RegisterMesh:
+class RegisterMesh(MeshOptions):
     """Register any template to any scan, two mesh files; writes the result, and its measures as JSON beside it."""
 
     template: Annotated[Positional[Path], arg(metavar="TEMPLATE")]

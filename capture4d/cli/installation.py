@@ -23,8 +23,8 @@ from typing import Any, Literal
 
 from packaging.requirements import Requirement
 
+from capture4d.cache import cache_path, can_write, kernel_cache
 from capture4d.cli.options import all_cores
-from capture4d.runs.cache import cache_path
 
 __all__ = ["Cache", "Diagnosis", "Machine", "Part", "as_json", "as_text", "diagnose", "load_apart", "load_one_by_one"]
 
@@ -85,6 +85,8 @@ class Cache:
     free_disk_gb: float | None
     fault: str
     """Why nothing can be written there; empty if it can."""
+    kernels: str
+    """Where compiled kernels are kept."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,6 +152,7 @@ def as_text(diagnosis: Diagnosis) -> str:
         ("machine", f"{machine.cores} cores, {memory} of memory, {free} of it free"),
         ("threads", threads),
         ("cache", f"{cache.folder}: {cache.mb:.0f} MB, {disk} free, {cache.fault or 'writable'}"),
+        ("kernels", cache.kernels),
     ]
     blocks = [_table(rows)]
     for title, required in (("required", True), ("optional", False)):
@@ -301,7 +304,15 @@ def _cache(folder: Path) -> Cache:
         mb=sum(path.lstat().st_size for path in _files(folder)) / 1e6,
         free_disk_gb=shutil.disk_usage(there).free / 1e9 if there else None,
         fault=fault,
+        kernels=_kernels(),
     )
+
+
+def _kernels() -> str:
+    folder = os.environ.get("NUMBA_CACHE_DIR") or kernel_cache()
+    if folder is None:
+        return "beside the code"
+    return str(folder) if can_write(Path(folder)) else "nowhere; every command compiles them anew"
 
 
 def _files(folder: Path) -> list[Path]:

@@ -15,6 +15,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, NoReturn
 
 import tyro
@@ -29,6 +30,7 @@ from capture4d.cli.stages import Extract, Register, Report, Run, Track
 from capture4d.cli.synthesis import Demo, Scan, Synth, SynthBoard
 from capture4d.cli.wrinkles import Compare, WrinklesApply, WrinklesMaps, WrinklesOffsets, WrinklesTrain
 from capture4d.errors import CommandLineError, InputError
+from capture4d.runs.address_space import memory_fault, require_address_space
 from capture4d.settings import gathered_faults
 from data_synth import config as synth_config
 from registration import config as registration_config
@@ -48,6 +50,9 @@ _DISK_ANSWERS = {
     errno.EPERM,
     errno.EROFS,
 }
+
+_ALLOW_OUTSIDE = "CAPTURE4D_ALLOW_OUTSIDE"
+"""As `capture4d.files.reading` knows it, which loads more than the command line should."""
 
 COMMANDS: Mapping[str, Any] = {
     "demo": Demo,
@@ -76,6 +81,9 @@ COMMANDS: Mapping[str, Any] = {
     "convert-poses": ConvertPoses,
     "doctor": Doctor,
 }
+
+_WRITE_FILES = (Template, RegisterMesh, Calibrate, ConvertBody, ConvertPoses, ConvertRig)
+"""Commands whose output is a file among others; that of the rest is a folder of their own."""
 
 _PRESETS: Mapping[Any, Mapping[str, Any]] = {
     Synth: synth_config.PRESETS,
@@ -137,6 +145,11 @@ def _run(arguments: list[str]) -> int:
         if not isinstance(error, WorkerDied):
             raise
         return _complain(str(error))
+    except (MemoryError, ImportError) as error:
+        said = memory_fault(error)
+        if said is None:
+            raise
+        return _complain(said)
     except KeyboardInterrupt:
         return _complain("interrupted; finished frames are kept, the same command goes on", code=INTERRUPTED)
     except _TerminatedError:
@@ -162,7 +175,10 @@ def _dispatch(arguments: list[str]) -> int:
         near = difflib.get_close_matches(name, COMMANDS, n=1)
         hint = f"; did you mean '{near[0]}'?" if near else ""
         return _complain(f"unknown command '{name}'{hint} (see capture4d --help)", code=BAD_COMMAND_LINE)
-    return _parse(name, rest)()
+    command = _parse(name, rest)
+    require_address_space(name)
+    with _allowing(command), _alone(command):
+        return command()
 
 
 def _parse(name: str, arguments: list[str]) -> Any:
@@ -187,6 +203,45 @@ def _parse(name: str, arguments: list[str]) -> Any:
         parsed = tyro.cli(command, prog=f"capture4d {name}", args=arguments, default=default)
     check_command(parsed, faults, arguments)
     return parsed
+
+
+@contextlib.contextmanager
+def _alone(command: Any) -> Iterator[None]:
+    """No other command writes to the same place meanwhile."""
+    output = _written_by(command)
+    if output is None:
+        yield
+        return
+    from capture4d.runs.locks import alone
+
+    folder = not isinstance(command, _WRITE_FILES)
+    with alone(output, folder=folder, wait=getattr(command, "wait", False)):
+        yield
+
+
+def _written_by(command: Any) -> Path | None:
+    """The folder, or the file, that a command writes to; None if it writes nothing."""
+    if isinstance(command, Report):
+        return command.work / "report" if command.work.is_dir() else None
+    if isinstance(command, Fit) and command.output is None:
+        return command.works[0] if command.works and command.works[0].is_dir() else None
+    work = getattr(command, "work", None)
+    return getattr(command, "output", None) or (work if work is not None and work.is_dir() else None)
+
+
+@contextlib.contextmanager
+def _allowing(command: Any) -> Iterator[None]:
+    """What a command allows its readers is told by the environment, which worker processes inherit."""
+    before = os.environ.get(_ALLOW_OUTSIDE)
+    if getattr(command, "allow_outside", False):
+        os.environ[_ALLOW_OUTSIDE] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            os.environ.pop(_ALLOW_OUTSIDE, None)
+        else:
+            os.environ[_ALLOW_OUTSIDE] = before
 
 
 def _value_of(option: str, arguments: list[str]) -> str | None:

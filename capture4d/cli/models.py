@@ -9,7 +9,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from capture4d.cli.exit_codes import GOOD
-from capture4d.cli.options import GradedOptions, StageOptions
+from capture4d.cli.options import GradedOptions, MeshOptions, StageOptions
 from capture4d.errors import CommandLineError
 from capture4d.settings import Number
 from retarget.config import AnimateConfig, FitConfig
@@ -18,7 +18,7 @@ __all__ = ["Animate", "Fit"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fit(StageOptions):
+class Fit(StageOptions, MeshOptions):
     """Learn the garment from registered takes: its blendshapes, and the regressors that drive them with poses."""
 
     works: Annotated[Positional[tuple[Path, ...]], arg(metavar="WORK")]

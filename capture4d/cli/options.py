@@ -13,11 +13,20 @@ from capture4d.settings import Count, Percent
 if TYPE_CHECKING:
     from capture4d.runs.stage import StageResult
 
-__all__ = ["GradedOptions", "StageOptions", "all_cores"]
+__all__ = ["GradedOptions", "MeshOptions", "StageOptions", "all_cores"]
 
 
 def all_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeshOptions:
+    """Of commands that read meshes."""
+
+    allow_outside: bool = False
+    """Read textures and buffers that a mesh names outside its folder and its capture's, too: of meshes you trust.
+    CAPTURE4D_ALLOW_OUTSIDE=1 in the environment does the same."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,6 +35,8 @@ class StageOptions:
     """Processes to use; the result does not depend on it."""
     overwrite: bool = False
     """Start clean: delete what an earlier run left in the output folder."""
+    wait: bool = False
+    """Wait for another command that is writing to the same folder, instead of refusing."""
 
 
 @dataclass(frozen=True, kw_only=True)

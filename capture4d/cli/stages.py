@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, UseAppendAction, arg
 
 from capture4d.cli.exit_codes import BAD_RESULT, GOOD
-from capture4d.cli.options import GradedOptions, StageOptions
+from capture4d.cli.options import GradedOptions, MeshOptions, StageOptions
 from capture4d.tracking.config import TrackingConfig
 from registration.config import RegistrationConfig
 
@@ -18,7 +18,7 @@ __all__ = ["Extract", "Register", "Report", "Run", "Track"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Extract(StageOptions):
+class Extract(StageOptions, MeshOptions):
     """Cut the garment out of every scan by its colour, and find its painted borders."""
 
     capture: Annotated[Positional[Path], arg(metavar="CAPTURE")]
@@ -49,7 +49,7 @@ class Extract(StageOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Track(StageOptions):
+class Track(StageOptions, MeshOptions):
     """Track the body through every scan: its poses, and one shape for the take."""
 
     capture: Annotated[Positional[Path], arg(metavar="CAPTURE")]
@@ -70,7 +70,7 @@ class Track(StageOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Register(GradedOptions):
+class Register(GradedOptions, MeshOptions):
     """Register the template to every frame whose garment `extract` has cut out."""
 
     capture: Annotated[Positional[Path], arg(metavar="CAPTURE")]
@@ -99,7 +99,7 @@ class Register(GradedOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Run(GradedOptions):
+class Run(GradedOptions, MeshOptions):
     """Run every stage on a capture: extract, track if it brings no poses, register, report."""
 
     capture: Annotated[Positional[Path], arg(metavar="CAPTURE")]
@@ -142,7 +142,7 @@ def _say_clouds(work: Path) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Report(StageOptions):
+class Report(StageOptions, MeshOptions):
     """Draw the report of a registered capture or an animated garment, and check its metrics against limits."""
 
     work: Annotated[Positional[Path], arg(metavar="WORK")]

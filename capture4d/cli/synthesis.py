@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from capture4d.cli.exit_codes import GOOD
-from capture4d.cli.options import StageOptions
+from capture4d.cli.options import MeshOptions, StageOptions
 from capture4d.errors import InputError
 from data_synth import config as synth_config
 from data_synth.scanner.config import ScanConfig
@@ -60,7 +60,7 @@ class Synth(StageOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scan(StageOptions):
+class Scan(StageOptions, MeshOptions):
     """Scan your own mesh sequence with the virtual camera rig: a capture folder, with truth if the faces stay."""
 
     meshes: Annotated[Positional[Path], arg(metavar="MESHES")]

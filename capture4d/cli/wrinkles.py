@@ -10,7 +10,7 @@ from tyro.conf import Positional, arg
 
 from capture4d.app.compare.config import CompareConfig
 from capture4d.cli.exit_codes import GOOD
-from capture4d.cli.options import StageOptions, all_cores
+from capture4d.cli.options import MeshOptions, StageOptions, all_cores
 from capture4d.settings import Count
 from wrinkles.normal_maps import config as wrinkle_config
 from wrinkles.normal_maps.config import PairConfig, WrinkleConfig
@@ -20,7 +20,7 @@ __all__ = ["Compare", "WrinklesApply", "WrinklesMaps", "WrinklesOffsets", "Wrink
 
 
 @dataclass(frozen=True, kw_only=True)
-class WrinklesMaps(StageOptions):
+class WrinklesMaps(StageOptions, MeshOptions):
     """Make normal maps of a registered take: low ones from the template, high ones from its scans.
 
     The model's answers to a take pair with its high maps: `capture4d animate MODEL --poses TAKE/body/poses.npz --output
@@ -44,7 +44,7 @@ class WrinklesMaps(StageOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class WrinklesTrain(StageOptions):
+class WrinklesTrain(StageOptions, MeshOptions):
     """Train the network that turns low maps into high ones, on registered takes; makes their maps if need be."""
 
     works: Annotated[Positional[tuple[Path, ...]], arg(metavar="WORK...")]
@@ -69,7 +69,7 @@ class WrinklesTrain(StageOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class WrinklesApply(StageOptions):
+class WrinklesApply(StageOptions, MeshOptions):
     """Make tangent-space normal maps with wrinkles for a registered or animated take."""
 
     model: Annotated[Positional[Path], arg(metavar="MODEL")]
@@ -91,7 +91,7 @@ class WrinklesApply(StageOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class WrinklesOffsets(StageOptions):
+class WrinklesOffsets(StageOptions, MeshOptions):
     """Learn offset images of a registered take from its poses, and a baseline without images; `compare` shows them."""
 
     work: Annotated[Positional[Path], arg(metavar="WORK")]
@@ -109,7 +109,7 @@ class WrinklesOffsets(StageOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Compare(StageOptions):
+class Compare(StageOptions, MeshOptions):
     """Compare registration, garment model, generated maps and offset images on the same held-out frames: one table, one
     page. Learns nothing itself: `fit`, `wrinkles train` and `wrinkles offsets` do."""
 

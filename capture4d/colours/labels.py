@@ -6,9 +6,9 @@ from functools import lru_cache
 
 import numpy as np
 from jaxtyping import UInt8
-from numba import njit
 
 from capture4d.colours.spaces import Colour, linear_colours
+from capture4d.heavy_imports import njit
 
 __all__ = ["FIRST_PAINT", "GARMENT", "OTHER", "classify_colours", "settle_labels"]
 

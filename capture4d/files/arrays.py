@@ -24,6 +24,12 @@ __all__ = ["DEFLATE_RATIO", "ArrayFile", "map_array", "mesh_arrays"]
 DEFLATE_RATIO = 1032
 """Nothing that deflate packed is longer than this many times its bytes (zlib's technical notes)."""
 
+_BELIEVED, _USUAL_RATIO = 1 << 28, 100
+"""Bytes that a member may always unpack to, and how much longer than packed it may be beyond: honest arrays of that
+size are not all zeros."""
+_LONGEST_HEADER = 1 << 16
+_SMALL = 1 << 16
+"""Entries along an axis that are believed of an array without bytes."""
 _CHUNK = 1 << 24
 
 
@@ -53,6 +59,10 @@ class ArrayFile:
             self._bytes = self._path.stat().st_size if self._data is None else len(self._data)
             found = [(info.filename.removesuffix(".npy"), info) for info in self._archive.infolist()]
             self._members = {name: info for name, info in found if name != info.filename}
+            if len(self._members) < sum(name != info.filename for name, info in found):
+                raise InputError("expected every array once, found one twice")
+            if sum(info.compress_size for _, info in found) > self._bytes:
+                raise InputError(f"damaged, its arrays claim more than the {self._bytes} bytes that it has")
             self._opened = opened.pop_all()
         return self
 
@@ -72,6 +82,8 @@ class ArrayFile:
         try:
             if info.compress_size > self._bytes or info.file_size > DEFLATE_RATIO * info.compress_size + 64:
                 raise InputError(f"{info.compress_size} of {self._bytes} bytes that claim to be {info.file_size}")
+            if info.file_size > max(_BELIEVED, _USUAL_RATIO * info.compress_size):
+                raise InputError(f"{info.compress_size} bytes that unpack to {info.file_size}, more than is believed")
             with self._archive.open(info) as file:
                 assert isinstance(file, io.BufferedIOBase)
                 return _read_array(file, info.file_size)
@@ -110,7 +122,7 @@ class ArrayFile:
     def number(self, name: str) -> float:
         """A single number; arrays of one will do."""
         value = self[name]
-        if value.size != 1 or value.dtype.kind not in "biuf":
+        if value.size != 1 or value.dtype.kind not in "iuf":
             raise InputError(
                 f"'{name}': expected one number, found {value.dtype} of shape {value.shape}", where=self._path
             )
@@ -148,7 +160,7 @@ def map_array(path: str | Path, *, expected: str = "an array", absent: str = "no
                 there = path.stat().st_size - file.tell()
         except (ValueError, EOFError, SyntaxError) as error:
             raise InputError(f"expected {expected}, found a damaged file ({one_line(error)})") from error
-        needed = math.prod(shape) * dtype.itemsize
+        needed = _bytes_of(shape, dtype)
         if not shape or needed != there:
             found = f"{shape} of {dtype}, {needed} bytes, of which {there} are there"
             raise InputError(f"expected {expected}, found a damaged file ({found})")
@@ -157,7 +169,7 @@ def map_array(path: str | Path, *, expected: str = "an array", absent: str = "no
 
 def _read_array(file: io.BufferedIOBase, length: int) -> np.ndarray:
     shape, fortran_order, dtype = _header(file)
-    expected, there = math.prod(shape) * dtype.itemsize, length - file.tell()
+    expected, there = _bytes_of(shape, dtype), length - file.tell()
     if expected != there:
         raise InputError(f"expected {shape} of {dtype}, {expected} bytes, found {there}")
     flat = np.empty(math.prod(shape), dtype)
@@ -170,9 +182,21 @@ def _read_array(file: io.BufferedIOBase, length: int) -> np.ndarray:
     return flat.reshape(shape[::-1]).T if fortran_order else flat.reshape(shape)
 
 
+def _bytes_of(shape: tuple[int, ...], dtype: np.dtype) -> int:
+    """How long an array is; one of many entries that take no bytes is refused."""
+    count = math.prod(shape)
+    if (count and not dtype.itemsize) or (not count and max(shape) > _SMALL):
+        raise InputError(f"expected an array, found {shape} of {dtype}, which has no bytes")
+    return count * dtype.itemsize
+
+
 def _header(file: io.BufferedIOBase) -> tuple[tuple[int, ...], bool, np.dtype]:
     """Shape, order and type, as they stand at the head of an npy file."""
     version = np.lib.format.read_magic(file)
+    begin, width = file.tell(), 2 if version == (1, 0) else 4
+    if (size := int.from_bytes(file.read(width), "little")) > _LONGEST_HEADER:
+        raise InputError(f"expected a header of at most {_LONGEST_HEADER} bytes, found {size}")
+    file.seek(begin)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that a header is old, or has a strange escape
         if version == (1, 0):

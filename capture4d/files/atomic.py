@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from capture4d.errors import InputError
+from capture4d.files.json_values import json_value
 from capture4d.files.reading import reading
 
 __all__ = [
@@ -145,8 +146,8 @@ def read_json_lines(path: str | Path) -> list[dict[str, Any]]:
     """Read a file with a JSON object a line; whatever is wrong with it is an InputError that names it and the line."""
     path = Path(path)
     rows = []
-    with reading(path, "JSON file"):
-        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+    with reading(path, "JSON file"), path.open(encoding="utf-8-sig") as lines:
+        for number, line in enumerate(lines, start=1):
             try:
                 rows.append(_json_object(line))
             except InputError as error:
@@ -155,10 +156,7 @@ def read_json_lines(path: str | Path) -> list[dict[str, Any]]:
 
 
 def _json_object(text: str | bytes, expected: str = "a JSON object") -> dict[str, Any]:
-    try:
-        found = json.loads(text if isinstance(text, str) else text.decode())
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"not valid JSON ({error})") from None
+    found = json_value(text)
     if not isinstance(found, dict):
         raise InputError(f"expected {expected}, found {type(found).__name__}")
     return found

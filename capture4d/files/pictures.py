@@ -6,6 +6,7 @@ import io
 import struct
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
@@ -43,10 +44,26 @@ def picture_pixels(data: bytes) -> UInt8[np.ndarray, "rows columns 3"]:
             with Image.open(io.BytesIO(data), formats=_FORMATS) as image:
                 if not _plausible(image.size, data):
                     raise InputError(f"{len(data)} bytes that claim to be {image.width} x {image.height} pixels")
-                return np.array(image.convert("RGB"))
+                return _bytes_of(image)
     except Exception as error:  # whatever Pillow's readers meet in a damaged file
         says = "none of " + ", ".join(_FORMATS) if isinstance(error, UnidentifiedImageError) else one_line(error)
         raise InputError(f"not a readable image, damaged or too large ({says})") from error
+
+
+def _bytes_of(image: Any) -> UInt8[np.ndarray, "rows columns 3"]:
+    """Of an opened image; Pillow alone would cut off grey levels above 255 instead of scaling them."""
+    if image.mode.startswith("I;16"):
+        grey = np.asarray(image).astype(np.uint16) / 257
+    elif image.mode in ("I", "F"):
+        grey = np.asarray(image).astype(np.float64)
+        if not np.isfinite(grey).all() or grey.min(initial=0) < 0:
+            raise InputError("expected grey levels from 0, found others")
+        grey = grey * 255 if image.mode == "F" and grey.max(initial=0) <= 1 else grey / 257
+        if grey.max(initial=0) > 255.5:
+            raise InputError("expected grey levels of 8 or 16 bits, found larger ones")
+    else:
+        return np.array(image.convert("RGB"))
+    return np.repeat(np.rint(grey).astype(np.uint8)[:, :, None], 3, axis=2)
 
 
 def holds_pixels(data: bytes) -> bool:

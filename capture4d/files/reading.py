@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import os
+import stat
 from collections.abc import Iterator
 from os import PathLike, fspath
 from pathlib import Path, PurePath, PureWindowsPath
@@ -12,8 +14,18 @@ import numpy as np
 
 from capture4d.errors import InputError
 
-__all__ = ["companion", "one_line", "reading", "shortened"]
+__all__ = ["ALLOW_OUTSIDE", "companion", "one_line", "reading", "require_file", "shortened"]
 
+ALLOW_OUTSIDE = "CAPTURE4D_ALLOW_OUTSIDE"
+"""Variable of the environment, which worker processes inherit."""
+_DEEPEST = 3
+"""Folders above that of a mesh in which its capture.json may lie."""
+_NO_FILES = (
+    (stat.S_ISFIFO, "a pipe"),
+    (stat.S_ISSOCK, "a socket"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+)
 _ABSENT = (errno.ENOENT, errno.ENOTDIR)
 _MEANT_OF_THE_CONTENT = (errno.EINVAL, errno.EOVERFLOW)
 """What the system answers to a place in the file, or a size, that a damaged file named."""
@@ -31,6 +43,7 @@ def reading(path: str | PathLike[str], kind: str = "file", *, absent: str = "no 
         kind: what was expected, as in "npz file".
         absent: what to say of a file that is not there.
     """
+    require_file(path, kind)
     try:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # no numbers are found by what checks them
             yield
@@ -64,22 +77,55 @@ def shortened(text: str, most: int = 500) -> str:
 
 
 def companion(path: Path, name: str, what: str) -> Path:
-    """The file that another file names, beside it or below its folder.
+    """The file that another file names: in its folder or below, or, for a capture's, anywhere in the capture.
+
+    Links are followed before that is judged. CAPTURE4D_ALLOW_OUTSIDE=1, which `--allow-outside` sets, lets a name lead
+    anywhere.
 
     Args:
         name: as it stands in the file.
         what: what it is to that file, as in "texture".
     Raises:
-        InputError: there is no such file, or the name leads elsewhere: a file from a stranger does not say what is
-            read on this machine.
+        InputError: there is no such file, or the name leads elsewhere, or to what is no file: a file from a stranger
+            does not say what is read on this machine.
     """
-    inside = PurePath(name)
-    if "\0" in name or inside.is_absolute() or PureWindowsPath(name).drive or ".." in inside.parts:
-        raise InputError(f"expected the {what} beside it or in a folder below, found {name!r}", where=path)
-    found = path.parent / inside
+    found = path.parent / name
+    absolute = PurePath(name).is_absolute() or PureWindowsPath(name).drive
+    if "\0" in name:
+        raise InputError(f"expected the name of a {what}, found {shortened(repr(name), 200)}", where=path)
+    if os.environ.get(ALLOW_OUTSIDE) != "1" and (absolute or not _within(found, path.parent)):
+        told = shortened(repr(name), 200)
+        raise InputError(
+            f"expected the {what} beside it or in a folder below, found {told}; --allow-outside reads it all the same",
+            where=path,
+        )
+    require_file(found, what)
     if not found.is_file():
         raise InputError(f"no such file, the {what} of {path.name}", where=found)
     return found
+
+
+def require_file(path: str | PathLike[str], kind: str) -> None:
+    """Raises InputError where something is there that is neither file nor folder: opening a pipe waits for its writer,
+    and a device has no end."""
+    try:
+        mode = os.stat(path).st_mode
+    except (OSError, ValueError):  # whoever opens it says what is wrong
+        return
+    if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+        found = next((name for test, name in _NO_FILES if test(mode)), "something else")
+        raise InputError(f"expected a {kind}, found {found}", where=path)
+
+
+def _within(found: Path, folder: Path) -> bool:
+    """Whether a path, its links followed, lies in a folder, or in the capture that the folder belongs to."""
+    try:
+        place, folder = found.resolve(), folder.resolve()
+    except (OSError, RuntimeError):  # links that go in circles
+        return False
+    nearest = [folder, *folder.parents][: 1 + _DEEPEST]
+    above = next((each for each in nearest if (each / "capture.json").is_file()), folder)
+    return place.is_relative_to(folder) or place.is_relative_to(above)
 
 
 def _damaged(path: str | PathLike[str], kind: str, error: Exception) -> InputError:

@@ -11,6 +11,8 @@ import numpy as np
 from capture4d.errors import InputError
 from capture4d.files.arrays import ArrayFile, mesh_arrays
 from capture4d.files.atomic import read_json, write_json, write_npz
+from capture4d.files.border_loops import on_open_edges
+from capture4d.files.json_values import number
 from capture4d.files.reading import reading
 from capture4d.types import Body, Garment, PoseSequence, Rig
 
@@ -89,7 +91,7 @@ def save_garment(path: str | Path, garment: Garment) -> None:
 def load_garment(path: str | Path, data: bytes | None = None) -> Garment:
     """Read a garment; `data` is what the file holds, if it was read already."""
     with ArrayFile(path, data) as arrays:
-        return Garment(
+        garment = Garment(
             template=arrays.mesh("template_"),
             loops=arrays.prefixed("loop_"),
             embedding_faces=arrays.get("embedding_faces"),
@@ -97,6 +99,7 @@ def load_garment(path: str | Path, data: bytes | None = None) -> Garment:
             skin_weights=arrays.get("skin_weights"),
             body_shape=arrays.get("body_shape"),
         )
+        return on_open_edges(garment)
 
 
 def save_rig(path: str | Path, rig: Rig) -> None:
@@ -154,13 +157,18 @@ def _camera_arrays(names: Sequence[str], cameras: Sequence[dict[str, Any]], entr
 
 def _camera_array(name: str, camera: dict[str, Any], entry: str, shape: tuple[int, ...]) -> np.ndarray:
     try:
-        values = np.array(camera[entry], np.float64)
-    except (ValueError, TypeError, OverflowError):
+        values = np.array(_leaves(camera[entry], entry), np.float64)
+    except (ValueError, OverflowError):
         raise InputError(f"camera {name!r}: expected numbers as {entry}, found something else") from None
     if values.shape != shape:
         expected, seen = (" x ".join(map(str, size)) or "one" for size in (shape, values.shape))
         raise InputError(f"camera {name!r}: expected {expected} numbers as {entry}, found {seen}")
     return values
+
+
+def _leaves(value: Any, entry: str) -> Any:
+    """Nested lists of numbers; true and "1" are none."""
+    return [_leaves(each, entry) for each in value] if isinstance(value, list) else number(value, entry)
 
 
 def _distortion(name: str, camera: dict[str, Any]) -> np.ndarray:

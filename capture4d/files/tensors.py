@@ -14,6 +14,7 @@ import safetensors.numpy
 
 from capture4d.errors import InputError
 from capture4d.files.atomic import write_bytes
+from capture4d.files.json_values import json_value
 from capture4d.files.reading import reading
 
 __all__ = ["TensorFile", "read_tensors", "write_tensors"]
@@ -74,8 +75,10 @@ def read_tensors(path: str | Path, kind: str) -> TensorFile:
             start = stream.read(4)
         try:
             with safetensors.safe_open(path, framework="numpy") as file:
-                note = json.loads((file.metadata() or {}).get(_NOTE, "{}"))
+                note = json_value((file.metadata() or {}).get(_NOTE, "{}"))
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+        except InputError:
+            raise
         except Exception as error:  # whatever the reader meets
             if start.startswith(_PICKLE_STARTS):  # a header of 128 bytes begins like a pickle, but it can be read
                 raise InputError("expected a safetensors file, found a pickle or an archive, which is not opened"

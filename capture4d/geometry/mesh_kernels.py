@@ -7,7 +7,8 @@ on one thread, so that results never depend on the machine's load.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from capture4d.heavy_imports import njit
 
 __all__ = ["face_components", "laplacian_pass", "mean_edge_length", "open_vertices", "vertex_normals_kernel"]
 

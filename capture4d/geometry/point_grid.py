@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64, Int64
-from numba import njit
+
+from capture4d.heavy_imports import njit
 
 __all__ = ["PointGrid"]
 

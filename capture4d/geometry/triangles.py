@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float64, Integer
-from numba import njit
 from scipy.spatial import KDTree
+
+from capture4d.heavy_imports import njit
 
 __all__ = ["closest_in_triangle", "closest_on_faces", "count_intersecting_faces", "fan_distances"]
 

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Float32, Int32
-from numba import njit
 
 from capture4d.geometry.mesh import connected_components, face_areas
 from capture4d.geometry.uv_layout import island_boxes, shelve
+from capture4d.heavy_imports import njit
 from capture4d.types import Mesh
 
 __all__ = ["UvReport", "check_uv", "fresh_uv"]

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32, Int64
-from numba import njit
 
 from capture4d.errors import InputError
+from capture4d.heavy_imports import njit
 from capture4d.types import Mesh
 
 __all__ = ["UvRaster", "rasterise_uv", "sample_bilinear"]

@@ -8,9 +8,9 @@ holds the optimisers' learning rates and a note of the training's own.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -18,9 +18,12 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from capture4d.errors import InputError
+from capture4d.files.reading import reading
 from capture4d.files.tensors import TensorFile, read_tensors, write_tensors
 
-__all__ = ["load_weights", "read_checkpoint", "write_checkpoint"]
+__all__ = ["filled", "read_checkpoint", "write_checkpoint"]
+
+Network = TypeVar("Network", bound=nn.Module)
 
 _RANDOM = "random"
 
@@ -94,16 +97,27 @@ def read_checkpoint(
     return _tensors(file.prefixed("tensors.")), note
 
 
-def load_weights(network: nn.Module, weights: Mapping[str, Tensor], *, source: str | Path) -> None:
-    """Fill a network.
+def filled(make: Callable[[], Network], weights: Mapping[str, Tensor], *, source: str | Path) -> Network:
+    """A network of a file, made and filled; what its description claims costs no memory before the weights are there.
 
     Args:
-        source: the file that the weights are from, for the message.
+        make: makes the network from what the file says of it.
+        source: the file, for the message.
     Raises:
-        InputError: they are the weights of another architecture.
+        InputError: they are the weights of another architecture, or no weights.
     """
-    _require_weights(network, weights, source)
-    network.load_state_dict(dict(weights))
+    with reading(source, "network"):
+        with torch.device("meta"):
+            network = make()
+        _require_weights(network, weights, source)
+        for key, value in weights.items():
+            if not value.dtype.is_floating_point and key.rpartition(".")[2] != "num_batches_tracked":
+                raise InputError(f"'{key}': expected floating-point weights, found {value.dtype}")
+            if not torch.isfinite(value).all():
+                raise InputError(f"'{key}': expected finite weights, found NaN or inf")
+        network.to_empty(device="cpu")
+        network.load_state_dict(dict(weights))
+    return network
 
 
 def _require_weights(network: nn.Module, weights: Mapping[str, Tensor], source: str | Path) -> None:

@@ -1,1 +1,1 @@
-"""How work is run: stage folders that resume, worker processes, the user's cache."""
+"""How work is run: stage folders that resume, worker processes."""

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from capture4d.errors import StaleError
-from capture4d.files.atomic import file_digest, plain_value, read_json, write_json
-from capture4d.runs.stage import differences
+from capture4d.files.atomic import file_digest, plain_value, write_json
+from capture4d.runs.stage import differences, read_record
 
 __all__ = ["FileStage", "open_file_stage"]
 
@@ -66,7 +66,7 @@ def open_file_stage(
         StaleError: the files were made with other settings.
     """
     settings = {"stage": name, "schema": schema, "config": json.loads(json.dumps(config, default=plain_value))}
-    earlier = read_json(record_path) if record_path.is_file() else None
+    earlier = read_record(record_path) if record_path.is_file() else None
     changed = [] if earlier is None else list(differences(settings, earlier))
     if changed and not overwrite:
         raise StaleError(f"was made with other settings ({'; '.join(changed[:3])}); use --overwrite", where=record_path)

@@ -20,11 +20,33 @@ from typing import Any
 
 from capture4d.errors import InputError, StaleError
 from capture4d.files.atomic import TEMPORARY_SUFFIX, file_digest, plain_value, read_json, write_json
+from capture4d.files.json_values import entry, text, whole
+from capture4d.files.reading import reading
+from capture4d.runs.locks import LOCK
 
-__all__ = ["Stage", "StageResult", "complete_record", "differences", "open_stage", "require_complete", "result_of"]
+__all__ = [
+    "SCHEMAS",
+    "Stage",
+    "StageResult",
+    "complete_record",
+    "differences",
+    "open_stage",
+    "read_record",
+    "require_complete",
+    "result_of",
+]
 
 FORMER_NAMES = {"wrinkles maps": "pairs", "wrinkles train": "train-wrinkles", "wrinkles apply": "wrinkles"}
 """Names that stages have had: a folder that bears one is read, and continued, as the stage's own."""
+FORMER_STAGES = {former: name for name, former in FORMER_NAMES.items()}
+
+
+SCHEMAS = {
+    "animate": 1, "calibrate": 1, "compare": 5, "extract": 4, "fit": 4, "register": 3, "report": 3, "scan": 2,
+    "synth": 2, "synth-board": 1, "track": 4, "training-set": 1, "wrinkles apply": 2, "wrinkles maps": 1,
+    "wrinkles offsets": 1, "wrinkles train": 1,
+}  # fmt: skip
+"""Formats of the stages' outputs: a folder with a higher number comes from a later version."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +154,7 @@ def open_stage(
         InputError: the folder holds something else.
         StaleError: it holds this stage, made with other settings or from other inputs.
     """
+    assert schema <= SCHEMAS.get(name, schema), f"SCHEMAS says less of {name}"
     folder = Path(folder)
     record_path = folder / "stage.json"
     settings = {
@@ -142,7 +165,7 @@ def open_stage(
     }
     if folder.exists() and not folder.is_dir():
         raise InputError("expected a folder to write to, found a file", where=folder)
-    existing = read_json(record_path) if record_path.exists() else None
+    existing = read_record(record_path) if record_path.exists() else None
     if existing is not None and existing.get("stage") == FORMER_NAMES.get(name):
         existing = {**existing, "stage": name}
     if existing is None and folder.is_dir() and not _is_blank(folder):
@@ -171,7 +194,7 @@ def open_stage(
 
 def result_of(folder: Path, output: Path | None = None) -> StageResult:
     """What the run that finished a stage returned, as far as its record knows."""
-    return StageResult(output or folder, read_json(folder / "stage.json")["digest"])
+    return StageResult(output or folder, read_record(folder / "stage.json")["digest"])
 
 
 def require_complete(
@@ -203,7 +226,7 @@ def complete_record(
     folder = Path(folder)
     if not (folder / "stage.json").is_file():
         raise InputError(f"expected the output of '{name}', found none; run: {command}", where=folder)
-    record = read_json(folder / "stage.json")
+    record = read_record(folder / "stage.json")
     if record.get("stage") not in (name, FORMER_NAMES.get(name)):
         raise InputError(f"expected the output of '{name}', found output of '{record.get('stage')}'", where=folder)
     if record.get("status") != "complete":
@@ -215,6 +238,34 @@ def complete_record(
                 f"state; run: {command} --overwrite",
                 where=folder,
             )
+    return record
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """What a stage.json, or the record of a stage without a folder, says.
+
+    Raises:
+        InputError: it is damaged, of no stage, or of a later version.
+    """
+    record = read_json(path)
+    with reading(path, "record of a stage"):
+        name, schema = text(entry(record, "stage"), "stage"), whole(entry(record, "schema"), "schema")
+        if not name.isprintable():
+            raise InputError(f"stage: expected a name, found {name[:40]!r}")
+        newest = SCHEMAS.get(FORMER_STAGES.get(name, name), schema)
+        if schema > newest:
+            raise InputError(
+                f"expected format {newest} of '{name}' or an earlier one, found {schema}: it comes from a later "
+                "version of capture4d"
+            )
+        if record.get("status") == "complete":
+            text(entry(record, "digest"), "digest")
+        for key in ("upstream", "sources"):
+            if not isinstance(record.get(key, {}), dict):
+                raise InputError(f"{key}: expected an object, found {type(record[key]).__name__}")
+        for key in ("upstream", "sources"):
+            for each, value in record.get(key, {}).items():
+                text(value, f"{key}.{each[:40]}")
     return record
 
 
@@ -236,14 +287,16 @@ def _short(value: Any) -> str:
 
 def _is_blank(folder: Path) -> bool:
     """Nothing in it but folders and the temporary files of a run that was killed before its first file."""
-    return not any(path.is_file() and path.suffix != TEMPORARY_SUFFIX for path in folder.rglob("*"))
+    return not any(
+        path.is_file() and path.suffix != TEMPORARY_SUFFIX and path.name != LOCK for path in folder.rglob("*")
+    )
 
 
 def _discard(folder: Path, record: dict[str, Any]) -> None:
     """Empty a stage folder; if that is interrupted, the record left behind says to go on."""
     write_json(folder / "stage.json", {**record, "status": "discarded"})
     for path in folder.iterdir():
-        if path.name == "stage.json":
+        if path.name in ("stage.json", LOCK):
             continue
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)

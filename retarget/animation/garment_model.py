@@ -13,6 +13,7 @@ from capture4d.body.skinning import ShapedBody
 from capture4d.errors import InputError
 from capture4d.files.atomic import read_json
 from capture4d.files.records import load_body
+from capture4d.runs.stage import read_record
 from capture4d.types import BlendshapeModel, Body, PoseSequence
 from retarget.animation.animator import FRAMES_AT_ONCE, Animator
 from retarget.animation.bodies import captured_person, person_of_shape, require_motion, retargeted_mean
@@ -148,7 +149,7 @@ def _model_folder(path: Path) -> Path:
         raise InputError(f"expected {MODEL} or the folder that holds it, found another file", where=path)
     if not (folder / MODEL).is_file():
         raise InputError(f"expected a model ({MODEL}), found none; run: capture4d fit WORK", where=folder)
-    record = read_json(folder / "stage.json") if (folder / "stage.json").is_file() else {}
+    record = read_record(folder / "stage.json") if (folder / "stage.json").is_file() else {}
     if record.get("status", "complete") != "complete":
         raise InputError("'fit' is not finished; run its command again", where=folder)
     return folder

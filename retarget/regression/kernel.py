@@ -25,6 +25,8 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, Int64
 
 from capture4d.errors import InputError
+from capture4d.files.json_values import number
+from capture4d.files.reading import reading
 from capture4d.learning.kernels import likeness, ridge_answers
 from retarget.config import KernelConfig
 from retarget.regression.controls import ControlLayout
@@ -35,6 +37,7 @@ from retarget.regression.regressors import (
     Scales,
     good_frames,
     read_regressor,
+    require_scales,
     with_best_ridge,
     write_regressor,
 )
@@ -193,5 +196,7 @@ def load_kernel(path: Path, *, model_digest: str) -> KernelRegressor:
         raise InputError(
             f"expected learned frames of {wanted[0]} and {wanted[1]}, found {found[0]}, {found[1]}", where=path
         )
-    line, ridge = float(file.entry("line")), float(file.entry("ridge"))
+    require_scales(path, scales, controls=layout.size, shapes=len(middle))
+    with reading(path, "kernel regressor"):
+        line, ridge = (number(file.entry(name), name) for name in ("line", "ridge"))
     return KernelRegressor(layout, scales, views, shares, line, frames, answers, middle, ridge)

@@ -21,7 +21,9 @@ from jaxtyping import Float, Float32, Float64, Int64
 from scipy.spatial.transform import Rotation
 
 from capture4d.errors import InputError
-from capture4d.files.tensors import read_tensors, write_tensors
+from capture4d.files.json_values import number, texts, wholes
+from capture4d.files.reading import reading
+from capture4d.files.tensors import TensorFile, read_tensors, write_tensors
 from capture4d.types import PoseSequence
 from retarget.regression.controls import ControlLayout
 from retarget.regression.regressors import Clip, Regressor, good_frames
@@ -310,12 +312,37 @@ def load_known_range(path: Path, *, model_digest: str) -> KnownRange:
     file = read_tensors(path, _KIND)
     if file.entry("model") != model_digest:
         raise InputError("expected the range of the blendshapes beside it, found that of another model", where=path)
-    poses = PoseRange(
-        file["quaternions"], tuple(int(joint) for joint in file.entry("joints")), float(file.entry("validated_deg"))
-    )
-    controls = {
-        str(name): ControlRange(file[f"{name}.mean"], file[f"{name}.largest"], file[f"{name}.poses"])
-        for name in file.entry("controls")
-    }
-    coefficients = CoefficientRange(file["std"], file["largest"], float(file.entry("length")))
-    return KnownRange(poses, controls, coefficients, float(file.entry("stretch_p99")))
+    with reading(path, "known range"):
+        joints = wholes(file.entry("joints"), "joints")
+        quaternions = file["quaternions"]
+        if quaternions.dtype != np.float32 or quaternions.shape[1:] != (len(joints), 4):
+            found = f"{quaternions.dtype} of {quaternions.shape}"
+            raise InputError(f"expected quaternions of {len(joints)} joints as float32, found {found}")
+        if not (np.abs(np.linalg.norm(quaternions, axis=2) - 1) < 1e-3).all():
+            raise InputError("expected quaternions of length 1, found others")
+        controls = {name: _control_range(file, name) for name in texts(file.entry("controls"), "controls")}
+        if not {*controls} <= {"linear", "kernel"}:
+            raise InputError(f"expected controls of linear and kernel, found {', '.join(sorted(controls))}")
+        return KnownRange(
+            PoseRange(quaternions, joints, number(file.entry("validated_deg"), "validated_deg")),
+            controls,
+            _coefficient_range(file),
+            number(file.entry("stretch_p99"), "stretch_p99"),
+        )
+
+
+def _control_range(file: TensorFile, name: str) -> ControlRange:
+    found = ControlRange(file[f"{name}.mean"], file[f"{name}.largest"], file[f"{name}.poses"])
+    for each, axes in ((found.mean, 1), (found.largest, 1), (found.poses, 2)):
+        if each.ndim != axes or each.dtype != np.float32 or not np.isfinite(each).all():
+            raise InputError(f"{name}: expected finite float32 controls, found {each.dtype} of {each.shape}, or NaN")
+    return found
+
+
+def _coefficient_range(file: TensorFile) -> CoefficientRange:
+    std, largest = file["std"], file["largest"]
+    if std.ndim != 1 or std.shape != largest.shape or not (np.isfinite(std).all() and np.isfinite(largest).all()):
+        raise InputError(f"expected a finite range for each coefficient, found {std.shape} and {largest.shape}, or NaN")
+    if std.min(initial=1) <= 0:
+        raise InputError("expected positive standard deviations, found others")
+    return CoefficientRange(std, largest, number(file.entry("length"), "length"))

@@ -14,6 +14,8 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from capture4d.errors import InputError
+from capture4d.files.json_values import number
+from capture4d.files.reading import reading
 from retarget.config import LinearConfig
 from retarget.regression.controls import ControlLayout
 from retarget.regression.regressors import (
@@ -23,6 +25,7 @@ from retarget.regression.regressors import (
     Scales,
     good_frames,
     read_regressor,
+    require_scales,
     with_best_ridge,
     with_history,
     write_regressor,
@@ -136,4 +139,6 @@ def load_linear(path: Path, *, model_digest: str) -> LinearRegressor:
     inputs = layout.size + layout.config.history * len(intercept)
     if matrix.shape != (inputs, len(intercept)):
         raise InputError(f"expected a matrix of {(inputs, len(intercept))}, found {matrix.shape}", where=path)
-    return LinearRegressor(layout, scales, matrix, intercept, float(file.entry("ridge")))
+    require_scales(path, scales, controls=inputs, shapes=len(intercept))
+    with reading(path, "linear regressor"):
+        return LinearRegressor(layout, scales, matrix, intercept, number(file.entry("ridge"), "ridge"))

@@ -20,7 +20,8 @@ from jaxtyping import Float, Float32
 from torch import Tensor, nn
 
 from capture4d.errors import InputError
-from capture4d.learning.checkpoints import load_weights
+from capture4d.files.reading import one_line
+from capture4d.learning.checkpoints import filled
 from capture4d.settings import SettingError
 from retarget.config import LstmConfig
 from retarget.regression.controls import ControlLayout
@@ -169,14 +170,19 @@ def load_lstm(
     try:
         config = LstmConfig(**file.entry("lstm"))
     except TypeError as error:
-        raise InputError(f"expected the settings of an LSTM, found others ({error})", where=path) from None
+        raise InputError(f"expected the settings of an LSTM, found others ({one_line(error)})", where=path) from None
     except SettingError as fault:
         raise fault.at(path) from None
     placed = usable_device(device)
     shapes = len(scales.std)
-    network = EncoderDecoder(layout.size + layout.config.history * shapes, shapes, config)
+    controls = layout.size + layout.config.history * shapes
     weights = {name: torch.from_numpy(each) for name, each in file.prefixed("network.").items()}
-    load_weights(network, weights, source=path)
+    if config.layers > len(weights) or len(scales.control_mean) != controls:
+        found = f"{len(weights)} tensors for {len(scales.control_mean)}"
+        raise InputError(
+            f"expected an LSTM of {config.layers} layers for {controls} controls, found {found}", where=path
+        )
+    network = filled(lambda: EncoderDecoder(controls, shapes, config), weights, source=path)
     if config.over_linear and linear is None:
         raise InputError("expected the linear regression it was trained over beside it, found none", where=path)
     return LstmRegressor(layout, scales, config, network.to(placed).eval(), linear if config.over_linear else None)

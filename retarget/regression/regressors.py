@@ -17,8 +17,10 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64
 
 from capture4d.errors import InputError
+from capture4d.files.json_values import entry, number, texts, wholes
+from capture4d.files.reading import reading
 from capture4d.files.tensors import TensorFile, read_tensors, write_tensors
-from capture4d.settings import SettingError
+from capture4d.value_checks import require_frame_rate
 from retarget.config import ControlConfig
 from retarget.regression.controls import ControlLayout
 
@@ -32,6 +34,7 @@ __all__ = [
     "good_frames",
     "mean_squared_error",
     "read_regressor",
+    "require_scales",
     "usual_response",
     "with_best_ridge",
     "with_history",
@@ -279,19 +282,38 @@ def read_regressor(path: Path, kind: str, *, model_digest: str) -> tuple[TensorF
     if file.entry("model") != model_digest:
         raise InputError("expected a regressor of the blendshapes beside it, found one of another model", where=path)
     for name, array in file.tensors.items():
-        if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
+        if not array.ndim or array.dtype.kind != "f":
+            raise InputError(f"'{name}': expected floats in rows, found {array.dtype} of {array.shape}", where=path)
+        if not np.isfinite(array).all():
             raise InputError(f"expected finite numbers, found NaN or inf in '{name}'", where=path)
-    return file, _load_layout(file), Scales(file["control_mean"], file["control_std"], file["coefficient_std"])
+    layout = _load_layout(file)
+    with reading(path, "regressor"):
+        names = ("control_mean", "control_std", "coefficient_std")
+        if any(file[name].ndim != 1 for name in names) or len(file[names[0]]) != len(file[names[1]]):
+            found = ", ".join(str(file[name].shape) for name in names)
+            raise InputError(f"expected scales in one row each, the first two as long as each other, found {found}")
+        return file, layout, Scales(*(file[name].astype(np.float32) for name in names))
 
 
 def _load_layout(file: TensorFile) -> ControlLayout:
     """The layout in a file's note."""
-    entry = dict(file.entry("layout"))
-    try:
-        config = ControlConfig(**{**entry["config"], "lags": tuple(entry["config"].get("lags", ()))})
-        joints, parents = (tuple(int(joint) for joint in entry[name]) for name in ("joints", "parents"))
-        return ControlLayout(tuple(entry["joint_names"]), joints, float(entry["fps"]), config, parents)
-    except SettingError as fault:
-        raise fault.at(file.path) from None
-    except Exception as error:  # whatever such JSON may hold instead
-        raise InputError(f"damaged description of the controls ({error})", where=file.path) from None
+    with reading(file.path, "description of the controls"):
+        described = file.entry("layout")
+        settings = entry(described, "config")
+        config = ControlConfig(**{**settings, "lags": wholes(settings.get("lags", []), "lags")})
+        names, fps = texts(entry(described, "joint_names"), "joint_names"), number(entry(described, "fps"), "fps")
+        joints = wholes(entry(described, "joints"), "joints")
+        parents = wholes(entry(described, "parents"), "parents", least=-1)
+        require_frame_rate("fps", fps)
+        if max(joints, default=0) >= len(names) or len(parents) not in (0, len(names)):
+            raise InputError(f"expected joints of {len(names)} and a parent for each, found others")
+        return ControlLayout(names, joints, fps, config, parents)
+
+
+def require_scales(path: Path, scales: Scales, *, controls: int, shapes: int) -> None:
+    """Raises InputError where what standardises a regressor is not of its size, or divides by nothing."""
+    found = tuple(len(each) for each in (scales.control_mean, scales.control_std, scales.std))
+    if found != (controls, controls, shapes):
+        raise InputError(f"expected scales of {controls} controls and {shapes} shapes, found {found}", where=path)
+    if min(scales.control_std.min(initial=1), scales.std.min(initial=1)) <= 0:
+        raise InputError("expected positive standard deviations, found others", where=path)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from capture4d.files.border_loops import on_open_edges
+from capture4d.files.json_values import number, text, texts
 from capture4d.files.reading import reading
 from capture4d.files.tensors import read_tensors, write_tensors
 from capture4d.types import BlendshapeModel, Garment, Mesh
@@ -38,15 +40,15 @@ def load_blendshapes(path: str | Path) -> BlendshapeModel:
         template = Mesh(file["template_vertices"], file["template_faces"], file.get("template_uv"))
         garment = Garment(
             template,
-            loops={name: file[f"loop_{name}"] for name in file.entry("loops")},
+            loops={name: file[f"loop_{name}"] for name in texts(file.entry("loops"), "loops")},
             **{name: file.get(name) for name in _OPTIONAL},
         )
         return BlendshapeModel(
-            garment,
+            on_open_edges(garment),
             mean=file["mean"],
             basis=file["basis"],
             std=file["std"],
-            joint_names=tuple(file.entry("joint_names")),
-            fps=float(file.entry("fps")),
-            licence=str(file.entry("licence")),
+            joint_names=texts(file.entry("joint_names"), "joint_names"),
+            fps=number(file.entry("fps"), "fps"),
+            licence=text(file.entry("licence"), "licence"),
         )

@@ -14,8 +14,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from capture4d.errors import InputError
+from capture4d.files.json_values import text, whole
+from capture4d.files.reading import one_line, reading
 from capture4d.files.tensors import read_tensors, write_tensors
-from capture4d.learning.checkpoints import load_weights
+from capture4d.learning.checkpoints import filled
 from capture4d.types import Mesh
 from wrinkles.normal_maps.config import MapConfig, NetworkConfig
 from wrinkles.normal_maps.networks import UNet, set_test_statistics
@@ -134,16 +136,19 @@ def load_model(path: str | PathLike[str]) -> WrinkleModel:
     try:
         config, maps = NetworkConfig(**file.entry("network")), MapConfig(**file.entry("maps"))
     except (TypeError, ValueError) as error:
-        raise InputError(f"expected the settings of a wrinkle generator, found others ({error})", where=path) from None
-    with torch.device("meta"):
-        generator = UNet(config)
-    generator.to_empty(device="cpu")
-    faces = file.get(FACES)
-    template = Mesh(file[VERTICES], np.zeros((0, 3), np.int32) if faces is None else faces, file.get(UV))
+        said = f"expected the settings of a wrinkle generator, found others ({one_line(error)})"
+        raise InputError(said, where=path) from None
     own = (VERTICES, FACES, UV)
     weights = {name: torch.from_numpy(each) for name, each in file.tensors.items() if name not in own}
-    load_weights(generator, weights, source=path)
+    with reading(path, "wrinkle generator"):
+        faces = file.get(FACES)
+        template = Mesh(file[VERTICES], np.zeros((0, 3), np.int32) if faces is None else faces, file.get(UV))
+        texels = whole(file.entry("texels"), "texels", least=1)
+        layout = text(file.entry("layout_digest"), "layout_digest")
+        if config.layers > len(weights):
+            raise InputError(f"expected weights of {config.layers} layers, found {len(weights)} tensors")
+    generator = filled(lambda: UNet(config), weights, source=path)
     return WrinkleModel(
         generator.to(memory_format=torch.channels_last),  # pyright: ignore[reportCallIssue]
-        config, texels=file.entry("texels"), maps=maps, layout_digest=file.entry("layout_digest"), template=template,
+        config, texels=texels, maps=maps, layout_digest=layout, template=template,
     )  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,10 @@ from jaxtyping import Int
 
 from capture4d.errors import InputError
 from capture4d.files.atomic import read_json
+from capture4d.files.json_values import entry, number, whole, wholes
+from capture4d.files.reading import reading, shortened
 from capture4d.files.tensors import read_tensors, write_tensors
-from capture4d.learning.checkpoints import load_weights
+from capture4d.learning.checkpoints import filled
 from capture4d.learning.networks import ImageDecoder
 from capture4d.runs.stage import complete_record
 from wrinkles.offset_images.networks import PcaFullyConnected, image_decoder
@@ -74,18 +77,22 @@ def load_offset_model(path: Path) -> OffsetModel:
         InputError: the file is missing, damaged or something else, or its weights are not those of its network.
     """
     file = read_tensors(path, KIND)
-    joints, texels, kind = np.array(file.entry("joints"), np.int64), file.entry("texels"), file.entry("network")
-    network: ImageDecoder | PcaFullyConnected
+    with reading(path, "network"):
+        kind, history = file.entry("network"), file.entry("history")
+        joints = np.array(wholes(file.entry("joints"), "joints"), np.int64)
+        texels = whole(file.entry("texels"), "texels", least=8)
+        if kind not in NETWORKS:
+            raise InputError(f"expected a network called {' or '.join(NETWORKS)}, found {shortened(str(kind), 80)}")
+        if not isinstance(history, list) or not all(isinstance(epoch, dict) for epoch in history):
+            raise InputError("history: expected a list of epochs, found something else")
+        make = partial(image_decoder, 9 * len(joints), texels)
+        if kind == BASELINE:
+            components, values = file["basis"].shape
+            make = partial(PcaFullyConnected, 9 * len(joints), values // 3, components=components)
+    network = filled(make, {name: torch.from_numpy(each) for name, each in file.tensors.items()}, source=path)
     if kind == DECODER:
-        network = image_decoder(9 * len(joints), texels)
         network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
-    elif kind == BASELINE:
-        components, values = file["basis"].shape
-        network = PcaFullyConnected(9 * len(joints), values // 3, components=components)
-    else:
-        raise InputError(f"expected a network called {' or '.join(NETWORKS)}, found {kind}", where=path)
-    load_weights(network, {name: torch.from_numpy(each) for name, each in file.tensors.items()}, source=path)
-    return OffsetModel(network.eval(), joints, texels, file.entry("history"))
+    return OffsetModel(network.eval(), joints, texels, history)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,7 +121,13 @@ def find_offsets(work: Path, *, registration: str) -> LearnedOffsets | None:
         return None
     command = f"capture4d wrinkles offsets {work}"
     record = complete_record(folder, STAGE, command, made_from={"registration": registration})
-    frames, config = read_json(folder / FRAMES), record["config"]
+    frames, config = read_json(folder / FRAMES), record.get("config")
     models = {name: load_offset_model(folder / f"{name}.safetensors") for name in NETWORKS}
-    seen = frozenset([*frames["learned"], *frames["chose_epoch"]])
-    return LearnedOffsets(record["digest"], config["held_out"], config["held_out_gap"], seen, models)
+    with reading(folder / FRAMES, "list of frames"):
+        seen = frozenset(frame for name in ("learned", "chose_epoch") for frame in wholes(entry(frames, name), name))
+    with reading(folder / "stage.json", "record of a stage"):
+        held_out, gap = (
+            number(entry(config, "held_out"), "held_out"),
+            whole(entry(config, "held_out_gap"), "held_out_gap"),
+        )
+    return LearnedOffsets(record["digest"], held_out, gap, seen, models)

@@ -39,8 +39,8 @@ from capture4d.captures.truth import TruthModel, read_truth_model, read_truth_ve
 from capture4d.captures.work_folder import VERDICTS, WorkFolder
 from capture4d.errors import InputError
 from capture4d.evaluation import correspondence_errors, material_points
-from capture4d.files.atomic import read_json, write_bytes, write_json
-from capture4d.runs.stage import StageResult, open_stage, require_complete, result_of
+from capture4d.files.atomic import write_bytes, write_json
+from capture4d.runs.stage import StageResult, open_stage, read_record, require_complete, result_of
 from capture4d.runs.workers import run_jobs, shared
 from capture4d.settings import Count, settings
 
@@ -411,7 +411,7 @@ def _run_rows(work: WorkFolder, capture: Capture, records: Sequence[Mapping[str,
 def is_current(folder: Path, current: Mapping[str, Any]) -> bool:
     if not all((folder / name).is_file() for name in ("stage.json", "index.html", "metrics.json")):
         return False
-    record = read_json(folder / "stage.json")
+    record = read_record(folder / "stage.json")
     return record.get("status") == "complete" and all(record.get(key) == value for key, value in current.items())
 
 

@@ -241,7 +241,7 @@ def test_bodies_garments_and_rigs_come_back(tmp_path: Path):
     )
     garment = Garment(
         Mesh(SQUARE.vertices, SQUARE.faces, rng.random((2, 3, 2), np.float32)),
-        {"hem": np.array([0, 1], np.int32), "cuff_left": np.array([2], np.int32)},
+        {"hem": np.array([3, 0, 1, 2], np.int32), "cuff_left": np.array([2, 1, 0, 3], np.int32)},
         skin_weights=weights,
     )
     rig = replace(calibration_rig(2, rng=rng), lenses=("brown", "fisheye"))

@@ -116,7 +116,7 @@ def broken_rigs(folder: Path) -> dict[str, str]:
         "not valid JSON": json.dumps(good)[:-40],
         "expected the entry 'intrinsics' for every camera, found none": json.dumps(without),
         "camera 'cam00': expected 4 x 4 numbers as T_camera_world, found 2 x 2": json.dumps(bent),
-        "Rig.intrinsics": json.dumps(lost),
+        "expected finite numbers, found NaN": json.dumps(lost),
         "expected the entry 'cameras'": json.dumps({"rig": []}),
         "expected a JSON object": "[]",
         "expected at least one camera": '{"format": 1, "cameras": []}',

@@ -221,7 +221,11 @@ def test_what_is_no_motion_is_named(tmp_path: Path) -> None:
     np.savez(tmp_path / "clip.npz", poses=np.zeros((2, 30)), trans=np.zeros((2, 3)))
     with pytest.raises(InputError, match="'poses': expected rotation vectors or matrices of 22 or more joints"):
         read_motion(tmp_path / "clip.npz", body)
-    write_motion(tmp_path / "own.npz", body, replace(random_poses(body, 7), joint_names=tuple("j" * 36)))
+    write_motion(
+        tmp_path / "own.npz",
+        body,
+        replace(random_poses(body, 7), joint_names=tuple(f"j{joint}" for joint in range(36))),
+    )
     with pytest.raises(InputError, match="expected the body's 36 joints"):
         read_motion(tmp_path / "own.npz", body)
 

@@ -16,7 +16,7 @@ import pytest
 
 from capture4d.errors import InputError
 from capture4d.files.atomic import read_json, write_bytes, write_json, write_npy_rows, write_npz
-from capture4d.runs.stage import Stage, open_stage, require_complete
+from capture4d.runs.stage import SCHEMAS, Stage, open_stage, require_complete
 from capture4d.runs.workers import WorkerDied, run_jobs
 
 FRAMES = (3, 4, 7)
@@ -344,3 +344,31 @@ def test_what_is_wrong_with_a_preparation_is_said_as_it_is(workers: int):
     with pytest.raises(InputError, match=r"^work: expected a folder, found none$") as caught:
         list(run_jobs(add_to, range(2), prepare=refuse, workers=workers, label="prepare"))
     assert (caught.value.where, caught.value.reason) == ("work", "expected a folder, found none")
+
+
+def test_a_record_of_a_later_version_is_refused(tmp_path: Path):
+    stage = open_test_stage(tmp_path / "stage")
+    finish_frames(stage)
+    record = read_json(tmp_path / "stage" / "stage.json")
+    for name, schema in (("register", SCHEMAS["register"] + 1), ("pairs", SCHEMAS["wrinkles maps"] + 1)):
+        write_json(tmp_path / "stage" / "stage.json", {**record, "stage": name, "schema": schema})
+        for read in (
+            lambda: require_complete(tmp_path / "stage", "register", "capture4d register"),
+            lambda: open_test_stage(tmp_path / "stage"),
+        ):
+            with pytest.raises(InputError, match=rf"format .* found {schema}: it comes from a later version of"):
+                read()
+
+
+@pytest.mark.parametrize("changed", [
+    {"stage": 3}, {"stage": "a\nb"}, {"schema": "1"}, {"schema": True}, {"digest": 7}, {"upstream": []},
+    {"upstream": {"garment": 1}}, {"sources": {"capture": None}},
+])  # fmt: skip
+def test_a_record_that_is_none_is_one_line(tmp_path: Path, changed: dict[str, object]):
+    finish_frames(open_test_stage(tmp_path / "stage"))
+    record = read_json(tmp_path / "stage" / "stage.json")
+    write_json(tmp_path / "stage" / "stage.json", record | changed)
+    with pytest.raises(InputError) as caught:
+        require_complete(tmp_path / "stage", "test", "capture4d test")
+    assert str(caught.value).startswith(str(tmp_path / "stage" / "stage.json"))
+    assert "\n" not in str(caught.value)

@@ -16,7 +16,7 @@ def some_model(*, uv: bool = True) -> BlendshapeModel:
     vertices = rng.standard_normal((5, 3)).astype(np.float32)
     faces = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4]], np.int32)
     template = Mesh(vertices, faces, rng.random((3, 3, 2)).astype(np.float32) if uv else None)
-    loops = {"neck": np.array([2, 1], np.int32), "hem": np.array([4, 0, 3], np.int32)}
+    loops = {"neck": np.array([2, 1, 0, 4, 3], np.int32), "hem": np.array([4, 0, 1, 2, 3], np.int32)}
     garment = Garment(
         template,
         loops,
@@ -41,7 +41,7 @@ def test_a_model_comes_back_whole(tmp_path: Path, uv: bool) -> None:
     for name in ("embedding_faces", "embedding_barycentric", "skin_weights", "body_shape"):
         np.testing.assert_array_equal(getattr(again.garment, name), getattr(model.garment, name))
     assert list(again.garment.loops) == ["neck", "hem"]
-    np.testing.assert_array_equal(again.garment.loops["hem"], [4, 0, 3])
+    np.testing.assert_array_equal(again.garment.loops["hem"], [4, 0, 1, 2, 3])
     assert (again.joint_names, again.fps, again.licence) == (model.joint_names, model.fps, model.licence)
     if uv:
         np.testing.assert_array_equal(again.garment.template.uv, model.garment.template.uv)

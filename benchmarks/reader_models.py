@@ -1,0 +1,133 @@
+"""Learned models as small as they come: what the kinds of `benchmarks.reader_kinds` write."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.reader_values import MESH, NAMES, PARENTS, RNG
+
+__all__ = ["MODELS"]
+
+DIGEST, SHAPES = "aa", 2
+
+
+def _layout() -> Any:
+    from retarget.config import ControlConfig
+    from retarget.regression.controls import ControlLayout
+
+    return ControlLayout(NAMES, (1, 2), 60.0, ControlConfig(), tuple(int(parent) for parent in PARENTS))
+
+
+def _scales(size: int) -> Any:
+    from retarget.regression.regressors import Scales
+
+    return Scales(np.zeros(size, np.float32), np.ones(size, np.float32), np.ones(SHAPES, np.float32))
+
+
+def _write_linear(path: Path) -> None:
+    from retarget.regression.linear import LinearRegressor, save_linear
+
+    layout = _layout()
+    matrix = RNG.random((layout.size, SHAPES), np.float32)
+    save_linear(path, LinearRegressor(layout, _scales(layout.size), matrix, np.zeros(SHAPES, np.float32), 0.1),
+                model_digest=DIGEST)  # fmt: skip
+
+
+def _read_linear(path: Path) -> Any:
+    from retarget.regression.linear import load_linear
+
+    return load_linear(path, model_digest=DIGEST)
+
+
+def _write_kernel(path: Path) -> None:
+    from retarget.regression.kernel import KernelRegressor, save_kernel
+
+    layout = _layout()
+    frames, answers = RNG.random((3, layout.size), np.float32), RNG.random((3, SHAPES), np.float32)
+    views, shares = (RNG.random((layout.size, 2), np.float32),), np.ones(1, np.float32)
+    regressor = KernelRegressor(
+        layout, _scales(layout.size), views, shares, 0.5, frames, answers, np.zeros(SHAPES, np.float32), 0.1
+    )
+    save_kernel(path, regressor, model_digest=DIGEST)
+
+
+def _read_kernel(path: Path) -> Any:
+    from retarget.regression.kernel import load_kernel
+
+    return load_kernel(path, model_digest=DIGEST)
+
+
+def _write_lstm(path: Path) -> None:
+    from retarget.config import LstmConfig
+    from retarget.regression.lstm import EncoderDecoder, LstmRegressor, save_lstm
+
+    layout, config = _layout(), LstmConfig(size=4, over_linear=False)
+    network = EncoderDecoder(layout.size, SHAPES, config)
+    save_lstm(path, LstmRegressor(layout, _scales(layout.size), config, network), model_digest=DIGEST)
+
+
+def _read_lstm(path: Path) -> Any:
+    from retarget.regression.lstm import load_lstm
+
+    return load_lstm(path, model_digest=DIGEST)
+
+
+def _write_poses(path: Path) -> None:
+    from retarget.regression.pose_range import PoseRange, save_pose_range
+
+    still = np.tile(np.array([0, 0, 0, 1], np.float32), (3, 2, 1))
+    save_pose_range(path, PoseRange(still, (1, 2), 5.0), model_digest=DIGEST)
+
+
+def _read_poses(path: Path) -> Any:
+    from retarget.regression.pose_range import load_pose_range
+
+    return load_pose_range(path, model_digest=DIGEST)
+
+
+def _write_generator(path: Path) -> None:
+    from wrinkles.normal_maps.config import MapConfig, NetworkConfig
+    from wrinkles.normal_maps.inference import WrinkleModel, save_model
+    from wrinkles.normal_maps.networks import UNet
+
+    config = NetworkConfig(filters=1, layers=3)
+    save_model(path, WrinkleModel(UNet(config), config, texels=8, maps=MapConfig(size=8), layout_digest="bb",
+                                  template=MESH))  # fmt: skip
+
+
+def _read_generator(path: Path) -> Any:
+    from wrinkles.normal_maps.inference import load_model
+
+    return load_model(path)
+
+
+def _write_offsets(path: Path, *, baseline: bool) -> None:
+    from wrinkles.offset_images.model_files import OffsetModel, save_offset_model
+    from wrinkles.offset_images.networks import PcaFullyConnected, image_decoder
+
+    joints = np.array([1, 2])
+    network = PcaFullyConnected(18, 3, components=2, hidden=256) if baseline else image_decoder(18, 16)
+    save_offset_model(path, OffsetModel(network, joints, 16, [{"epoch": 1, "loss": 0.5}]))
+
+
+def _read_offsets(path: Path) -> Any:
+    from wrinkles.offset_images.model_files import load_offset_model
+
+    return load_offset_model(path)
+
+
+MODELS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any]]] = {
+    "linear": (_write_linear, _read_linear),
+    "kernel": (_write_kernel, _read_kernel),
+    "lstm": (_write_lstm, _read_lstm),
+    "training_poses": (_write_poses, _read_poses),
+    "generator": (_write_generator, _read_generator),
+    "decoder": (partial(_write_offsets, baseline=False), _read_offsets),
+    "pca": (partial(_write_offsets, baseline=True), _read_offsets),
+}
+"""How a file of each is written, and read."""
