@@ -133,6 +133,9 @@ def _header(data: bytes) -> _Header:
             images[named[1]] = None
     if order is None or not elements:
         raise InputError("cut off in the header")
+    for element in elements.values():
+        if element.count and not element.properties:
+            raise InputError(f"damaged header, {element.count} records of '{element.name}' have no property")
     size = end.end()
     if end[1] == b"\r\n" and re.match(
         rb"[^\r\n]*\r[^\n]", data
@@ -175,6 +178,9 @@ def _triangles(strips: Lists) -> Lists:
 def _colours(element: Element) -> tuple[np.ndarray | None, tuple[str, ...]]:
     """Those of its records as bytes, if they have any."""
     for names in COLOURS:
+        listed = next((name for name in names if name in element.lists), None)
+        if listed is not None:
+            raise InputError(f"expected one number called {listed} in every {element.name}, found a list")
         if all(name in element.values for name in names):
             channels = [element.values[name] for name in names]
             if len({channel.dtype for channel in channels}) == 1:

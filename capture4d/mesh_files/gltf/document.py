@@ -119,6 +119,14 @@ class Document:
                 faults.append(fault)
         raise faults[0]
 
+    def require_buffers_inside(self) -> None:
+        """Refuse a file that names bytes which are not there, or elsewhere on this machine, even if it uses none."""
+        buffers = self.tree.get("buffers")
+        for each in buffers if isinstance(buffers, list) else []:
+            uri = each.get("uri") if isinstance(each, dict) else None
+            if isinstance(uri, str) and uri[:5].lower() != "data:":
+                self.beside("buffers", uri)
+
     def zeros(self, where: str, count: int, width: int, dtype: np.dtype) -> np.ndarray:
         """Rows of an accessor that has no bytes of its own."""
         buffers = self.tree.get("buffers")
@@ -156,7 +164,9 @@ def open_document(path: Path) -> Document:
     if not isinstance(tree, dict):
         raise InputError(f"not a readable GLB file, expected a JSON object, found {type(tree).__name__}")
     _require_readable(tree)
-    return Document(path, tree, binary, len(data))
+    document = Document(path, tree, binary, len(data))
+    document.require_buffers_inside()
+    return document
 
 
 def _chunks(data: bytes) -> tuple[bytes, bytes]:

@@ -367,3 +367,21 @@ def test_a_head_of_many_lines_is_read_at_once(tmp_path: Path):
         TEXT.replace("element face", f"element e 0\n{wide}element face"),
     ):
         assert read(tmp_path, data.encode()).mesh.faces.tolist() == TRIANGLES
+
+
+@pytest.mark.parametrize("channel", ["red", "g", "diffuse_blue"])
+def test_a_colour_that_is_a_list_is_none(channel: str, tmp_path: Path) -> None:
+    head = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    tail = "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    rows = "0 0 0 1 5\n1 0 0 2 5 5\n0 1 0 1 5\n3 0 1 2\n"
+    (tmp_path / "a.ply").write_text(f"{head}property list uchar uchar {channel}\n{tail}{rows}")
+    with pytest.raises(InputError, match=f"expected one number called {channel} in every vertex, found a list"):
+        read_mesh(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
+def test_records_without_a_property_are_refused(form: str, tmp_path: Path) -> None:
+    head = f"ply\nformat {form} 1.0\nelement junk 4000000000\nelement vertex 0\nproperty float x\nend_header\n"
+    (tmp_path / "a.ply").write_text(head)
+    with pytest.raises(InputError, match="4000000000 records of 'junk' have no property"):
+        read_mesh(tmp_path / "a.ply")
