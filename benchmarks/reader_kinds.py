@@ -61,7 +61,7 @@ from capture4d.files.records import (
 )
 from capture4d.files.tensors import read_tensors, write_tensors
 from capture4d.mesh_files.meshes import read_coloured_mesh, read_mesh, write_mesh
-from capture4d.motions.bvh import Bvh, format_bvh
+from capture4d.motions.bvh import Bvh, format_bvh, moved_by_root
 from capture4d.motions.motion_files import read_motion, write_amass, write_bvh
 from capture4d.runs.stage import open_stage, require_complete
 from capture4d.types import GarmentScan
@@ -161,7 +161,8 @@ def _other_bvh(path: Path) -> None:
     names = ("Hips", "LowerBack", "Spine", "Neck", "Head", "LeftArm", "LeftForeArm", "LeftHand")
     rotations = np.tile(np.eye(3), (2 * len(names), 1, 1))
     parents, offsets = np.array([-1, *range(len(names) - 1)]), RNG.random((len(names), 3))
-    motion = Bvh(path, names, parents, offsets, Rotation.from_matrix(rotations), np.zeros((2, 3)), 0.01)
+    motion = Bvh(path, names, parents, offsets, Rotation.from_matrix(rotations),
+                 moved_by_root(offsets, np.zeros((2, 3))), 0.01)  # fmt: skip
     path.write_text(format_bvh(motion, np.ones((len(names), 3))))
 
 

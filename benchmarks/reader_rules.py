@@ -203,7 +203,7 @@ RULES = (
         ("linear.safetensors", _tensor("matrix", _one(lambda _, at: _NAN))),
         ("kernel.safetensors", _tensor("frames", _one(lambda _, at: _INF))),
         ("lstm.safetensors", _tensor("coefficient_std", _one(lambda _, at: _NAN))),
-        ("training_poses.safetensors", _tensor("quaternions", _one(lambda _, at: _NAN))),
+        ("poses.safetensors", _tensor("quaternions", _one(lambda _, at: _NAN))),
         ("generator.safetensors", _tensor("reference", _one(lambda _, at: _NAN))),
         ("pca.safetensors", _tensor("mean", _one(lambda _, at: _NAN))),
         ("blendshapes.safetensors", _tensor("basis", _one(lambda _, at: _INF))),
@@ -224,7 +224,7 @@ RULES = (
         ("poses.npz", _arrays(rotations=_of(POSES.rotations @ _TURN))),
         ("poses.npz", _arrays(rotations=_with_entry(POSES.rotations, 0.5, 7.0, -3.0))),
         ("motion.npz", _arrays(rotations=_with_entry(POSES.rotations, 0.5, 7.0, -3.0))),
-        ("training_poses.safetensors", _tensor("quaternions", lambda chance, array: 2 * array)),
+        ("poses.safetensors", _tensor("quaternions", lambda chance, array: 2 * array)),
     )),
     Rule("Frames are numbered once each, from 0 up", (
         ("poses.npz", _arrays(frame_ids=_of(np.array([0, 1, 1], np.int32)))),
