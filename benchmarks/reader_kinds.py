@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from benchmarks import reader_models
+from benchmarks import reader_exports, reader_models
 from benchmarks.reader_values import (
     BLENDSHAPES,
     BODY,
@@ -282,6 +282,9 @@ KINDS = [
     Kind("any.safetensors", lambda path: write_tensors(path, "test", {"a": np.ones((2, 3), np.float32)}, {"b": [1]}),
          lambda path: read_tensors(path, "test").entry("b")),
     *(Kind(f"{name}.safetensors", make, read) for name, (make, read) in reader_models.MODELS.items()),
+    *(Kind(name, make, read, names_other=name.endswith((".obj", ".ply", ".gltf")))
+      for name, (make, read) in reader_exports.EXPORTS.items()),
+    *(Kind(name, make, read, names_other=True) for name, (make, read) in reader_exports.BESIDE.items()),
     Kind("truth/model.npz", _truth_model, lambda path: read_truth_model(_capture_of(path)), optional=True),
     Kind("truth/000001.npz", _truth_frame, lambda path: read_truth_frame(_capture_of(path), 1)),
     Kind("scan.npz", _garment_scan, lambda path: load_garment_scan(path, 1)),

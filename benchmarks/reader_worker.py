@@ -190,8 +190,8 @@ def judged(name: str, files: dict[str, bytes], *, refused: bool) -> tuple[str, s
     Args:
         refused: it breaks a rule and must have no value.
     """
+    from benchmarks.reader_judge import nonsense_in
     from benchmarks.reader_kinds import BY_NAME, fault_of, laid_out
-    from benchmarks.reader_rules import nonsense_in
 
     kind = BY_NAME[name]
     with laid_out(files, name) as path:
