@@ -240,7 +240,8 @@ RULES = (
         ("rig.json", _json("cameras", 0, "T_camera_world", 0, to=lambda chance, row: [2, *row[1:]])),
         ("rig.json", _json("cameras", 0, "T_camera_world", 0, to=lambda chance, row: [-1, *row[1:]])),
         ("cameras.xml", _swapped(rb"<transform>(1) 0", b"2", b"-1", b"0")),
-        ("transforms.json", _json("frames", 0, "transform_matrix", 0, 0, to=lambda chance, _: chance.choice((0, -1, 3)))),
+        ("transforms.json",
+         _json("frames", 0, "transform_matrix", 0, 0, to=lambda chance, _: chance.choice((0, -1, 3)))),
     )),
     Rule("Frames are numbered once each, from 0 up", (
         ("poses.npz", _arrays(frame_ids=_of(np.array([0, 1, 1], np.int32)))),
