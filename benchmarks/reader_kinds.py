@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from benchmarks import reader_models
+from benchmarks import reader_exports, reader_models
 from benchmarks.reader_values import (
     BLENDSHAPES,
     BODY,
@@ -61,7 +61,7 @@ from capture4d.files.records import (
 )
 from capture4d.files.tensors import read_tensors, write_tensors
 from capture4d.mesh_files.meshes import read_coloured_mesh, read_mesh, write_mesh
-from capture4d.motions.bvh import Bvh, format_bvh
+from capture4d.motions.bvh import Bvh, format_bvh, moved_by_root
 from capture4d.motions.motion_files import read_motion, write_amass, write_bvh
 from capture4d.runs.stage import open_stage, require_complete
 from capture4d.types import GarmentScan
@@ -161,7 +161,8 @@ def _other_bvh(path: Path) -> None:
     names = ("Hips", "LowerBack", "Spine", "Neck", "Head", "LeftArm", "LeftForeArm", "LeftHand")
     rotations = np.tile(np.eye(3), (2 * len(names), 1, 1))
     parents, offsets = np.array([-1, *range(len(names) - 1)]), RNG.random((len(names), 3))
-    motion = Bvh(path, names, parents, offsets, Rotation.from_matrix(rotations), np.zeros((2, 3)), 0.01)
+    motion = Bvh(path, names, parents, offsets, Rotation.from_matrix(rotations),
+                 moved_by_root(offsets, np.zeros((2, 3))), 0.01)  # fmt: skip
     path.write_text(format_bvh(motion, np.ones((len(names), 3))))
 
 
@@ -281,6 +282,9 @@ KINDS = [
     Kind("any.safetensors", lambda path: write_tensors(path, "test", {"a": np.ones((2, 3), np.float32)}, {"b": [1]}),
          lambda path: read_tensors(path, "test").entry("b")),
     *(Kind(f"{name}.safetensors", make, read) for name, (make, read) in reader_models.MODELS.items()),
+    *(Kind(name, make, read, names_other=name.endswith((".obj", ".ply", ".gltf")))
+      for name, (make, read) in reader_exports.EXPORTS.items()),
+    *(Kind(name, make, read, names_other=True) for name, (make, read) in reader_exports.BESIDE.items()),
     Kind("truth/model.npz", _truth_model, lambda path: read_truth_model(_capture_of(path)), optional=True),
     Kind("truth/000001.npz", _truth_frame, lambda path: read_truth_frame(_capture_of(path), 1)),
     Kind("scan.npz", _garment_scan, lambda path: load_garment_scan(path, 1)),

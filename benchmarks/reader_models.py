@@ -77,17 +77,28 @@ def _read_lstm(path: Path) -> Any:
     return load_lstm(path, model_digest=DIGEST)
 
 
-def _write_poses(path: Path) -> None:
-    from retarget.regression.pose_range import PoseRange, save_pose_range
+def _write_range(path: Path) -> None:
+    from retarget.regression.known_range import (
+        CoefficientRange,
+        ControlRange,
+        KnownRange,
+        PoseRange,
+        save_known_range,
+    )
 
+    layout = _layout()
     still = np.tile(np.array([0, 0, 0, 1], np.float32), (3, 2, 1))
-    save_pose_range(path, PoseRange(still, (1, 2), 5.0), model_digest=DIGEST)
+    poses = RNG.random((3, len(layout.pose_columns)), np.float32)
+    controls = ControlRange(np.zeros(layout.size, np.float32), np.ones(len(layout.parts), np.float32), poses)
+    coefficients = CoefficientRange(np.ones(SHAPES, np.float32), np.ones(SHAPES, np.float32), 2.0)
+    known = KnownRange(PoseRange(still, (1, 2), 5.0), {"linear": controls, "kernel": controls}, coefficients, 1.25)
+    save_known_range(path, known, model_digest=DIGEST)
 
 
-def _read_poses(path: Path) -> Any:
-    from retarget.regression.pose_range import load_pose_range
+def _read_range(path: Path) -> Any:
+    from retarget.regression.known_range import load_known_range
 
-    return load_pose_range(path, model_digest=DIGEST)
+    return load_known_range(path, model_digest=DIGEST)
 
 
 def _write_generator(path: Path) -> None:
@@ -125,7 +136,7 @@ MODELS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any]]] = {
     "linear": (_write_linear, _read_linear),
     "kernel": (_write_kernel, _read_kernel),
     "lstm": (_write_lstm, _read_lstm),
-    "training_poses": (_write_poses, _read_poses),
+    "poses": (_write_range, _read_range),
     "generator": (_write_generator, _read_generator),
     "decoder": (partial(_write_offsets, baseline=False), _read_offsets),
     "pca": (partial(_write_offsets, baseline=True), _read_offsets),

@@ -125,7 +125,8 @@ def _read_until_death(mutants: list[Mutant]) -> Iterator[Outcome]:
     try:
         if not ours.poll(10 * WALL_S):
             raise RuntimeError("the process that reads mutants did not begin")
-        ours.recv()  # it has loaded what readers need
+        if begun := ours.recv():  # nothing, when it has loaded what readers need
+            raise RuntimeError(f"the process that reads mutants did not begin:\n{begun}")
         for mutant in mutants:
             if not ours.poll(WALL_S):
                 process.kill()
@@ -149,8 +150,12 @@ def _serve(connection: multiprocessing.connection.Connection, mutants: list[Muta
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     sink = os.open(os.devnull, os.O_WRONLY)
     os.dup2(sink, 2)  # what native decoders print
-    _warm_up()
-    _limit_addresses()
+    try:
+        _warm_up()
+        _limit_addresses()
+    except BaseException:  # of a kind that is out of step with its reader, say
+        connection.send(traceback.format_exc())
+        return
     connection.send(None)
     for mutant in mutants:
         files = mutant.files()
@@ -185,8 +190,8 @@ def judged(name: str, files: dict[str, bytes], *, refused: bool) -> tuple[str, s
     Args:
         refused: it breaks a rule and must have no value.
     """
+    from benchmarks.reader_judge import nonsense_in
     from benchmarks.reader_kinds import BY_NAME, fault_of, laid_out
-    from benchmarks.reader_rules import nonsense_in
 
     kind = BY_NAME[name]
     with laid_out(files, name) as path:

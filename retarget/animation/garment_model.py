@@ -12,6 +12,7 @@ from jaxtyping import Float, Float32
 from capture4d.body.skinning import ShapedBody
 from capture4d.errors import InputError
 from capture4d.files.atomic import read_json
+from capture4d.files.reading import reading
 from capture4d.files.records import load_body
 from capture4d.runs.stage import read_record
 from capture4d.types import BlendshapeModel, Body, PoseSequence
@@ -130,6 +131,10 @@ def load_garment_model(path: str | Path, *, device: str = "cpu", with_lstm: bool
 
         lstm = load_lstm(folder / LSTM, model_digest=digest, linear=linear, device=device)
     known = load_known_range(folder / POSES, model_digest=digest)
+    with reading(folder / POSES, "known range"):
+        for name, each in (("linear", linear), ("kernel", kernel)):
+            if each is not None:
+                known.require(name, each.layout, len(model.std))
     body, validated = load_body(folder / "body.npz"), _validated(folder)
     return GarmentModel(folder, model, body, linear, kernel, lstm, known, validated, digest)
 

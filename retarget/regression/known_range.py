@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from capture4d.errors import InputError
 from capture4d.files.json_values import number, texts, wholes
-from capture4d.files.reading import reading
+from capture4d.files.reading import reading, shortened
 from capture4d.files.tensors import TensorFile, read_tensors, write_tensors
 from capture4d.types import PoseSequence
 from retarget.regression.controls import ControlLayout
@@ -282,6 +282,20 @@ class KnownRange:
         """How far from every learned pose a regressor is believed."""
         return min(max(SAFE_DEG[0], self.poses.validated_deg), SAFE_DEG[1])
 
+    def require(self, name: str, layout: ControlLayout, shapes: int) -> None:
+        """Raise InputError unless it belongs to such a regressor."""
+        found, coefficients = self.controls.get(name), len(self.coefficients.std)
+        if found is None:
+            raise InputError(f"expected controls of the {name} regressor, found none")
+        sizes = len(found.mean), len(found.largest), found.poses.shape[1]
+        expected = layout.size, len(layout.parts), len(layout.pose_columns)
+        if sizes != expected:
+            raise InputError(f"{name}: expected controls, parts and poses of {expected} numbers, found {sizes}")
+        if name == "linear" and self.poses.joints != layout.joints:
+            raise InputError(f"expected poses of the joints {layout.joints}, found {self.poses.joints}")
+        if coefficients != shapes:
+            raise InputError(f"expected the range of {shapes} coefficients, found {coefficients}")
+
     def bounded(self, name: str, regressor: Regressor) -> BoundedRegressor:
         """A regressor of that name within what is known."""
         controls = self.controls["kernel" if name == "kernel" else "linear"]
@@ -320,15 +334,25 @@ def load_known_range(path: Path, *, model_digest: str) -> KnownRange:
             raise InputError(f"expected quaternions of {len(joints)} joints as float32, found {found}")
         if not (np.abs(np.linalg.norm(quaternions, axis=2) - 1) < 1e-3).all():
             raise InputError("expected quaternions of length 1, found others")
-        controls = {name: _control_range(file, name) for name in texts(file.entry("controls"), "controls")}
-        if not {*controls} <= {"linear", "kernel"}:
-            raise InputError(f"expected controls of linear and kernel, found {', '.join(sorted(controls))}")
+        if min(joints, default=0) < 0 or len({*joints}) < len(joints):
+            raise InputError(f"expected joints once each, from 0 up, found {shortened(str(joints), 80)}")
+        names = texts(file.entry("controls"), "controls")
+        if "linear" not in names or not {*names} <= {"linear", "kernel"}:
+            raise InputError(f"expected controls of linear, or linear and kernel, found {shortened(str(names), 80)}")
         return KnownRange(
-            PoseRange(quaternions, joints, number(file.entry("validated_deg"), "validated_deg")),
-            controls,
+            PoseRange(quaternions, joints, _amount(file, "validated_deg")),
+            {name: _control_range(file, name) for name in names},
             _coefficient_range(file),
-            number(file.entry("stretch_p99"), "stretch_p99"),
+            _amount(file, "stretch_p99", above=True),
         )
+
+
+def _amount(file: TensorFile, name: str, *, above: bool = False) -> float:
+    """A number of the note, not below 0; or above it."""
+    found = number(file.entry(name), name)
+    if found < 0 or (above and found == 0):
+        raise InputError(f"expected {name} {'above' if above else 'from'} 0, found {found:g}")
+    return found
 
 
 def _control_range(file: TensorFile, name: str) -> ControlRange:
@@ -336,6 +360,8 @@ def _control_range(file: TensorFile, name: str) -> ControlRange:
     for each, axes in ((found.mean, 1), (found.largest, 1), (found.poses, 2)):
         if each.ndim != axes or each.dtype != np.float32 or not np.isfinite(each).all():
             raise InputError(f"{name}: expected finite float32 controls, found {each.dtype} of {each.shape}, or NaN")
+    if found.largest.min(initial=0) < 0:
+        raise InputError(f"{name}: expected distances from 0, found {found.largest.min():g}")
     return found
 
 
@@ -343,6 +369,6 @@ def _coefficient_range(file: TensorFile) -> CoefficientRange:
     std, largest = file["std"], file["largest"]
     if std.ndim != 1 or std.shape != largest.shape or not (np.isfinite(std).all() and np.isfinite(largest).all()):
         raise InputError(f"expected a finite range for each coefficient, found {std.shape} and {largest.shape}, or NaN")
-    if std.min(initial=1) <= 0:
-        raise InputError("expected positive standard deviations, found others")
-    return CoefficientRange(std, largest, number(file.entry("length"), "length"))
+    if std.min(initial=1) <= 0 or largest.min(initial=0) < 0:
+        raise InputError("expected positive standard deviations and sizes from 0, found others")
+    return CoefficientRange(std, largest, _amount(file, "length"))

@@ -1,6 +1,6 @@
 """Answers are those of the regressor where it was taught, and stay within what was learned everywhere else."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -67,7 +67,6 @@ def bounded(layout, clip) -> BoundedRegressor:
 
 
 def turned(poses: PoseSequence, degrees: float, joint: int = 1) -> PoseSequence:
-    from dataclasses import replace
 
     rotations = poses.rotations.copy()
     rotations[:, joint] = rotations[:, joint] @ Rotation.from_rotvec([0, np.radians(degrees), 0]).as_matrix()
@@ -169,3 +168,31 @@ def test_it_comes_back_from_its_file(bounded, layout, motion, tmp_path: Path) ->
     np.testing.assert_array_equal(again.predict(controls), bounded.predict(controls))
     with pytest.raises(InputError, match="found that of another model"):
         load_known_range(tmp_path / "poses.safetensors", model_digest="b")
+
+
+@pytest.mark.parametrize(
+    ("said", "fault"),
+    [
+        ("no kernel", "expected controls of the kernel regressor, found none"),
+        ("a part less", r"linear: expected controls, parts and poses of .+, found"),
+        ("a coefficient more", r"expected the range of \d+ coefficients, found \d+"),
+        ("a joint more", r"expected poses of the joints .+, found \(1, 2\)"),
+    ],
+)
+def test_a_range_of_another_regressor_is_one_line(bounded, layout, motion, said: str, fault: str) -> None:
+    poses = PoseRange(pose_quaternions(motion(9, 1).rotations, (1, 2)), (1, 2), 7.5)
+    controls = bounded.controls
+    if said == "a part less":
+        controls = replace(controls, largest=controls.largest[:-1])
+    shapes = len(bounded.coefficients.std)
+    known = KnownRange(replace(poses, joints=layout.joints), {"linear": controls}, bounded.coefficients, 1.25)
+    if said == "a joint more":
+        known, layout = replace(known, poses=poses), replace(layout, joints=(1, 3))
+    with pytest.raises(InputError, match=fault):
+        known.require("kernel" if said == "no kernel" else "linear", layout, shapes + (said == "a coefficient more"))
+
+
+def test_a_range_of_its_own_regressor_is_taken(bounded, layout, motion) -> None:
+    poses = PoseRange(pose_quaternions(motion(9, 1).rotations, layout.joints), layout.joints, 7.5)
+    known = KnownRange(poses, {"linear": bounded.controls}, bounded.coefficients, 1.25)
+    known.require("linear", layout, len(bounded.coefficients.std))
