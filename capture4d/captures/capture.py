@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -43,6 +42,7 @@ from capture4d.geometry.seams import welded_mesh
 from capture4d.mesh_files.meshes import READABLE, read_mesh, write_mesh
 from capture4d.types import Body, Garment, PoseSequence, Rig, Scan
 from capture4d.units import METRES, Units
+from capture4d.value_checks import require_frame_rate
 
 __all__ = [
     "Capture",
@@ -99,8 +99,10 @@ class Capture:
     def __post_init__(self) -> None:
         if not self.frame_ids:
             raise InputError("expected at least one frame, found none", where=self.path)
-        if not 0 < self.fps < math.inf:
-            raise InputError(f"expected a positive frame rate, found {self.fps}", where=self.path)
+        try:
+            require_frame_rate("fps", self.fps)
+        except InputError as error:
+            raise error.at(self.path) from None
         if list(self.frame_ids) != sorted(set(self.frame_ids)) or self.frame_ids[0] < 0:
             raise InputError("expected ascending frame numbers, each once and none negative", where=self.path)
         if self.frame_ids[-1] > LAST_FRAME:

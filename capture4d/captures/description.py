@@ -15,14 +15,13 @@ from capture4d.colours.spaces import Colour, parse_colour
 from capture4d.errors import InputError
 from capture4d.files.reading import shortened
 from capture4d.units import Units
+from capture4d.value_checks import LARGEST_RATE, SMALLEST_RATE
 
-__all__ = ["FORMAT", "FPS", "LAST_FRAME", "Description", "parse_description"]
+__all__ = ["FORMAT", "LAST_FRAME", "Description", "parse_description"]
 
 FORMAT = 1
 LAST_FRAME = 2**31 - 1
 """Frame numbers are int32 in every array of theirs."""
-FPS = (0.001, 1e6)
-"""From a frame in a quarter of an hour to what no camera does."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,8 +80,9 @@ def _fps(value: object) -> float:
         raise InputError(f"fps: expected a number, found {_shown(value)}")
     if not value > 0:
         raise InputError(f"fps: expected a positive frame rate, found {_shown(value)}")
-    if not FPS[0] <= value <= FPS[1]:
-        raise InputError(f"fps: expected a frame rate from {FPS[0]:g} to {FPS[1]:g}, found {_shown(value)}")
+    if not SMALLEST_RATE <= value <= LARGEST_RATE:
+        expected = f"a frame rate from {SMALLEST_RATE:g} to {LARGEST_RATE:g}"
+        raise InputError(f"fps: expected {expected}, found {_shown(value)}")
     return float(value)
 
 

@@ -123,7 +123,7 @@ DAMAGE = {
     "faces of other vertices": (replaced(head(3, 1) + "0 0 0 1 2 3\n" * 3 + "3 0 1 77\n"), "frame-unreadable"),
     "all in one place": (in_one_place, "frame-empty"),
     "far away": (far_away, "frame-unreadable"),
-    "a few points": (replaced(head(20, 0) + "0 0 1 1 2 3\n" * 20), "frame-unreadable"),
+    "a few points": (replaced(head(20, 0) + "".join(f"{x} 0 {x % 3} 1 2 3\n" for x in range(20))), "frame-unreadable"),
     "points in a plane": (replaced(head(400, 0) + FLAT), ""),
     "one triangle": (replaced(head(3, 1) + "0 0 0 1 2 3\n1 0 0 1 2 3\n0 1 0 1 2 3\n3 0 1 2\n"), ""),
     "no colours": (no_colours, "colours-missing"),

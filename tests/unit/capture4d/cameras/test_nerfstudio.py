@@ -140,7 +140,7 @@ GOOD = {"w": 640, "h": 480, "fl_x": 500.0, "file_path": "a.png", "transform_matr
         ({"h": 0}, "expected whole pixels as h"),
         ({"fl_x": "500"}, "expected a finite number as fl_x, found '500'"),
         ({"fl_x": -1.0}, "camera 'a': expected positive focal lengths"),
-        ({"fl_x": float("nan")}, "expected a finite number as fl_x"),
+        ({"fl_x": float("nan")}, "expected finite numbers, found NaN"),
         ({"k4": 0.1}, "expected no k4 of a lens of OPENCV"),
         ({"camera_model": "OPENCV_FISHEYE", "p1": 0.1}, "expected no p1 of a lens of OPENCV_FISHEYE"),
         ({"camera_model": "EQUIRECTANGULAR"}, "expected a camera_model of OPENCV.*found 'EQUIRECTANGULAR'"),

@@ -204,5 +204,5 @@ def test_a_pipe_under_the_name_of_a_scan_is_one_line(
     scan.unlink()
     os.mkfifo(scan)
     said = one_line(capsys, "extract", tube_capture, "--output", tmp_path / "work", "--workers", "1")
-    assert said == f"capture4d: {scan}: expected a scan, found a pipe\n"
+    assert said == f"capture4d: {scan}: no such scan; 1 of 3 frames in capture.json have none\n"
     assert not (tmp_path / "work").exists()

@@ -112,7 +112,7 @@ def test_a_preset_is_what_single_options_start_from(monkeypatch: pytest.MonkeyPa
         (
             InputError("expected cloth,\nfound none", where="scan.ply"),
             1,
-            "capture4d: scan.ply: expected cloth, found none\n",
+            "capture4d: scan.ply: expected cloth,\\nfound none\n",
         ),
         (PermissionError(13, "Permission denied", "out/x.npz"), 1, "capture4d: out/x.npz: Permission denied\n"),
         (

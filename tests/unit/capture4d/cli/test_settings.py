@@ -86,5 +86,5 @@ def test_a_mesh_file_that_cannot_be_written_is_named_first(
     with pytest.raises(SystemExit) as exit_:
         main(["register-mesh", "a.ply", "b.ply", "--output", "out.stl"])
     assert exit_.value.code == 1
-    assert "out.stl: expected a mesh file (.obj, .ply, .glb), found '.stl'" in capsys.readouterr().err
+    assert "out.stl: expected a mesh file (.obj, .ply, .glb, .off), found '.stl'" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())

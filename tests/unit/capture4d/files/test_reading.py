@@ -44,10 +44,18 @@ def test_a_capture_is_one_place_to_what_lies_in_it(tmp_path: Path) -> None:
     assert colours(scan_with("../scans/t.png", tmp_path)) == [90] * 3
 
 
+@pytest.mark.parametrize("name", ["C:\\t.png", "/{outside}/t.png"])
+def test_of_an_absolute_path_the_name_counts(name: str, tmp_path: Path) -> None:
+    path = scan_with(name.replace("/{outside}", str(tmp_path)), tmp_path)
+    Image.fromarray(np.full((2, 2, 3), 10, np.uint8)).save(path.with_name("t.png"))
+    assert colours(path) == [10] * 3
+
+
 @pytest.mark.parametrize("name", ["../../t.png", "../scans/../../t.png", "C:\\t.png", "/{outside}/t.png"])
 def test_outside_of_it_nothing_is_read(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     name = name.replace("/{outside}", str(tmp_path))
     path = scan_with(name, tmp_path)
+    path.with_name("t.png").unlink()
     (tmp_path / "capture" / "capture.json").write_text("{}")
     with pytest.raises(InputError, match=r"expected the texture .* --allow-outside reads it all the same"):
         colours(path)

@@ -61,7 +61,7 @@ def turned(change: Any) -> list[list[float]]:
         ({"lens": "fisheye"}, "camera 'front': expected 4 numbers as distortion, found 5"),
         ({"lens": "fov"}, "camera 'front': expected a lens of brown, fisheye, found 'fov'"),
         ({"lens": None}, "camera 'front': expected a lens of brown, fisheye, found None"),
-        ({"distortion": [0, 0, 0, 0, float("nan")]}, "Rig.distortion: expected finite numbers"),
+        ({"distortion": [0, 0, 0, 0, float("nan")]}, "expected finite numbers, found NaN"),
         ({"T_camera_world": turned(np.diag([1, 1, 1.1]))}, "camera 'front': expected a rotation.* lengths 1, 1, 1.1"),
         ({"T_camera_world": turned(1e-3 * np.eye(3))}, "camera 'front': expected a rotation"),
         ({"T_camera_world": turned(np.diag([1, 1, -1]))}, "camera 'front': expected a rotation.* a mirror image"),

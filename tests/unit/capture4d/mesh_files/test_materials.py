@@ -265,7 +265,7 @@ def test_textures_need_uvs(folder: Path):
         (obj("usemtl a"), "newmtl a\nmap_Kd textures/../../r.png", "expected the texture beside it"),
         (obj("usemtl a"), "newmtl a\nmap_Kd ..\\up\\r.png", "expected the texture beside it"),
         (obj("usemtl a"), "newmtl a\nmap_Kd %2e%2e/up/r.png", "r.png: no such file, the texture"),
-        (obj("usemtl a"), "newmtl a\nmap_Kd \0.png", "expected the texture beside it"),
+        (obj("usemtl a"), "newmtl a\nmap_Kd \0.png", "expected the name of a texture"),
         (obj("usemtl a"), f"newmtl a\nmap_Kd {'x' * 5000}.png", "x.obj: "),
         (obj("usemtl a"), "newmtl a\nmap_Kd x.obj", "not a readable image"),
         (obj("usemtl a"), "newmtl a\nmap_Kd textures", "no such file, the texture"),

@@ -199,7 +199,7 @@ def test_resampling_at_the_same_rate_changes_nothing() -> None:
     np.testing.assert_allclose(doubled.rotations[::2], poses.rotations, atol=1e-6)
 
 
-@pytest.mark.parametrize(("own", "fps"), [(60.0, 1e12), (1e-200, 60.0), (60.0, np.inf)])
+@pytest.mark.parametrize(("own", "fps"), [(60.0, 1e12), (0.01, 1e5), (60.0, np.inf)])
 def test_a_rate_that_is_none_asks_for_no_memory(own: float, fps: float, tmp_path: Path) -> None:
     save_poses(tmp_path / "poses.npz", replace(random_poses(load_anny(), 6), fps=own))
     with pytest.raises(InputError, match=r"poses\.npz: expected at most 100000 frames"):
@@ -249,11 +249,13 @@ def test_rotations_that_are_none_are_named(tmp_path: Path) -> None:
     body = load_anny()
     poses = random_poses(body, 2)
     for wrong in (np.zeros((3, 3)), np.diag([1, 1, -1]), 2 * np.eye(3)):
-        rotations = poses.rotations.copy()
-        rotations[3, 6] = wrong
-        save_poses(tmp_path / "poses.npz", replace(poses, rotations=rotations))
+        save_poses(tmp_path / "poses.npz", poses)
+        with np.load(tmp_path / "poses.npz") as whole:
+            arrays = dict(whole)
+        arrays["rotations"][3, 6] = wrong
+        np.savez(tmp_path / "poses.npz", **arrays)
         with pytest.raises(
-            InputError, match=r"poses\.npz: expected rotations, found a matrix that is none in frame 3, foot"
+            InputError, match=r"poses\.npz: PoseSequence.rotations: expected rotations, .* row 3, joint 6"
         ):
             read_motion(tmp_path / "poses.npz", body)
 
