@@ -281,7 +281,8 @@ def _metashape(path: Path) -> None:
         '<calibration type="frame" class="adjusted"><resolution width="640" height="480"/><f>900</f><cx>3</cx>'
         "<cy>-2</cy><b1>0.5</b1><k1>0.01</k1><p1>0.001</p1></calibration></sensor></sensors>\n"
         '<components next_id="1"><component id="0" label="Component 1"><transform>'
-        "<rotation>1 0 0 0 1 0 0 0 1</rotation><translation>1 2 3</translation><scale>0.25</scale></transform></component></components>\n"
+        "<rotation>1 0 0 0 1 0 0 0 1</rotation><translation>1 2 3</translation><scale>0.25</scale>"
+        "</transform></component></components>\n"
         f'<cameras next_id="2"><group id="0" label="a">{camera(0)}</group>{camera(1)}</cameras>\n</chunk></document>\n'
     )
 

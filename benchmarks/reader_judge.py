@@ -16,6 +16,8 @@ from capture4d.types import BlendshapeModel, Body, Garment, Mesh, PoseSequence, 
 
 __all__ = ["nonsense_in"]
 
+_MAY_BE_NAN = ("residual_m",)
+"""Of a vertex that no scan covers."""
 ROTATION, WEIGHTS = 5e-3, 2e-3
 """What is forgiven of rotations and of weights."""
 
@@ -38,6 +40,8 @@ def nonsense_in(value: Any) -> str:
         found = "" if len(value.colours) == len(value.mesh.vertices) else "colours of other vertices"
     elif isinstance(value, Rig):
         found = _rig(value)
+    elif isinstance(value, np.memmap):
+        found = ""  # whoever maps it reads the part that is needed, and judges that
     elif isinstance(value, float | np.ndarray):
         finite = not np.issubdtype(np.asarray(value).dtype, np.floating) or bool(np.isfinite(value).all())
         found = "" if finite else "a number that is not finite"
@@ -50,7 +54,8 @@ def nonsense_in(value: Any) -> str:
 
 def _parts(value: Any) -> list[Any]:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return [getattr(value, field.name) for field in dataclasses.fields(value)]
+        names = [field.name for field in dataclasses.fields(value)]
+        return [getattr(value, name) for name in names if name not in _MAY_BE_NAN]
     if isinstance(value, Mapping):
         return list(value.values())
     return list(value) if isinstance(value, list | tuple) else []

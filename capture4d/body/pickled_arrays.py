@@ -92,7 +92,7 @@ class _Machine:
             if known is None:
                 raise InputError("cut off, or not a pickle")
             if known.name == "STOP":
-                return self._stack.pop()
+                return self._taken(1)[0]
             self._step(known.name, self._argument(known))
 
     def _argument(self, known: Any) -> Any:

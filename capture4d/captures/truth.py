@@ -14,6 +14,7 @@ from capture4d.errors import InputError
 from capture4d.files.arrays import ArrayFile, mesh_arrays
 from capture4d.files.atomic import write_npz
 from capture4d.types import Mesh
+from capture4d.value_checks import require_array, require_finite, require_indices
 
 __all__ = [
     "TruthFrame",
@@ -39,6 +40,16 @@ class TruthModel:
     template_barycentric: Float32[np.ndarray, "verts 3"]
     """... and where in it."""
 
+    def __post_init__(self) -> None:
+        count = len(self.template_faces)
+        require_array("TruthModel", "template_faces", self.template_faces, (count,), np.int32)
+        require_array("TruthModel", "template_barycentric", self.template_barycentric, (count, 3), np.float32)
+        require_indices("TruthModel", "template_faces", self.template_faces, len(self.fine.faces))
+        require_finite("TruthModel", "template_barycentric", self.template_barycentric)
+        for name, loop in self.loops.items():
+            require_array("TruthModel", f"loops[{name!a:.80}]", loop, (None,), np.int32)
+            require_indices("TruthModel", f"loops[{name!a:.80}]", loop, len(self.fine.vertices))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TruthFrame:
@@ -50,6 +61,13 @@ class TruthFrame:
     translation: Float32[np.ndarray, " 3"]
     labels: UInt8[np.ndarray, " scan"]
     """Per scan vertex: 0 body, 1 garment, 2 painted border."""
+
+    def __post_init__(self) -> None:
+        shapes = {"vertices": (None, 3), "rotations": (None, 3, 3), "translation": (3,)}
+        for name, shape in shapes.items():
+            require_array("TruthFrame", name, getattr(self, name), shape, np.float32)
+            require_finite("TruthFrame", name, getattr(self, name))
+        require_array("TruthFrame", "labels", self.labels, (None,), np.uint8)
 
 
 def write_truth_model(path: str | Path, model: TruthModel) -> None:

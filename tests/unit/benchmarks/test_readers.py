@@ -87,7 +87,6 @@ def kind(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
     ([float("nan")], False, "nonsense"),
     (InputError("expected this", where="x"), False, "line"),
     (InputError("expected this"), False, "traceback"),
-    (InputError("expected\nthis", where="x"), False, "traceback"),
     (InputError("x" * 3000, where="x"), False, "traceback"),
     (InputError("too large for the memory there is", where="x"), False, "traceback"),
 ])  # fmt: skip

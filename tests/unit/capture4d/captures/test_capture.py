@@ -31,6 +31,7 @@ from capture4d.captures.truth import (
 )
 from capture4d.colours.spaces import format_colour, parse_colour
 from capture4d.errors import InputError
+from capture4d.files.atomic import write_npz
 from capture4d.files.records import load_body, load_garment, load_rig, save_body, save_garment, save_poses, save_rig
 from capture4d.geometry.mesh import boundary_loops
 from capture4d.mesh_files.meshes import write_mesh
@@ -286,6 +287,40 @@ def test_truth_comes_back(capture: Capture):
     np.testing.assert_array_equal(read_truth_vertices(capture, 11), SQUARE.vertices)
     with pytest.raises(InputError, match=r"000012\.npz: no such file"):
         read_truth_frame(capture, 12)
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"rotations": np.full((1, 3, 3), np.nan, np.float32)}, "rotations: expected finite numbers"),
+        ({"translation": np.full(3, np.inf, np.float32)}, "translation: expected finite numbers"),
+        ({"vertices": np.zeros((4, 2), np.float32)}, "vertices"),
+        ({"labels": np.zeros(4)}, "labels"),
+    ],
+)
+def test_a_true_state_that_is_none_is_one_line(changed: dict[str, np.ndarray], said: str, capture: Capture):
+    arrays = {"vertices": SQUARE.vertices, "rotations": np.eye(3, dtype=np.float32)[None],
+              "translation": np.zeros(3, np.float32), "labels": np.zeros(4, np.uint8)}  # fmt: skip
+    write_npz(capture.path / "truth" / "000011.npz", **(arrays | changed))
+    with pytest.raises(InputError, match=rf"truth/000011\.npz: .*{said}"):
+        read_truth_frame(capture, 11)
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"template_faces": np.full(5, 2, np.int32)}, "template_faces: expected indices from 0 to 1, found 2"),
+        ({"template_barycentric": np.full((5, 3), np.nan, np.float32)}, "template_barycentric: expected finite"),
+        ({"template_barycentric": np.zeros((4, 3), np.float32)}, "template_barycentric"),
+        ({"loop_hem": np.array([0, 4], np.int32)}, r"loops\['hem'\]: expected indices from 0 to 3, found 4"),
+    ],
+)
+def test_a_true_garment_that_is_none_is_one_line(changed: dict[str, np.ndarray], said: str, capture: Capture):
+    arrays = {"fine_vertices": SQUARE.vertices, "fine_faces": SQUARE.faces, "loop_hem": np.array([0, 1], np.int32),
+              "template_faces": np.zeros(5, np.int32), "template_barycentric": np.zeros((5, 3), "f4")}  # fmt: skip
+    write_npz(capture.path / "truth" / "model.npz", **(arrays | changed))
+    with pytest.raises(InputError, match=rf"truth/model\.npz: .*{said}"):
+        read_truth_model(capture)
 
 
 def test_a_damaged_or_foreign_archive_is_named(tmp_path: Path):

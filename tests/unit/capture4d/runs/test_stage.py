@@ -1,6 +1,8 @@
 """Output is whole or absent, stages resume and refuse, workers end with their parent."""
 
+import ast
 import errno
+import importlib
 import os
 import signal
 import subprocess
@@ -344,6 +346,26 @@ def test_what_is_wrong_with_a_preparation_is_said_as_it_is(workers: int):
     with pytest.raises(InputError, match=r"^work: expected a folder, found none$") as caught:
         list(run_jobs(add_to, range(2), prepare=refuse, workers=workers, label="prepare"))
     assert (caught.value.where, caught.value.reason) == ("work", "expected a folder, found none")
+
+
+OPENERS = ("open_stage", "open_file_stage")
+
+
+def test_the_formats_that_are_known_are_those_that_are_written() -> None:
+    """What every opened stage in the packages hands on as its name and its schema."""
+    root, written = Path(__file__).parents[4], dict[str, int]()
+    for package in ("capture4d", "data_synth", "registration", "retarget", "wrinkles"):
+        for path in (root / package).rglob("*.py"):
+            text = path.read_text()
+            if not any(f"{opener}(" in text for opener in OPENERS) or "SCHEMA = " not in text:
+                continue
+            module = importlib.import_module(path.relative_to(root).with_suffix("").as_posix().replace("/", "."))
+            for call in ast.walk(ast.parse(text)):
+                if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id in OPENERS:
+                    name = next(word.value for word in call.keywords if word.arg == "name")
+                    stage = name.value if isinstance(name, ast.Constant) else getattr(module, ast.unparse(name))
+                    written[stage] = max(module.SCHEMA, written.get(stage, 0))
+    assert written == SCHEMAS
 
 
 def test_a_record_of_a_later_version_is_refused(tmp_path: Path):
