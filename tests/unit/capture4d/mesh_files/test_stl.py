@@ -87,7 +87,7 @@ def test_trimesh_agrees(kind: str, tmp_path: Path):
 def test_it_goes_in_and_not_out(tmp_path: Path):
     (tmp_path / "x.STL").write_text(text())
     assert read_coloured_mesh(tmp_path / "x.STL").colours is None
-    with pytest.raises(InputError, match=r"expected a mesh file \(.obj, .ply, .glb\), found '.stl'"):
+    with pytest.raises(InputError, match=r"expected a mesh file \(.obj, .ply, .glb, .off\), found '.stl'"):
         write_mesh(tmp_path / "y.stl", read_mesh(tmp_path / "x.STL").mesh)
 
 
