@@ -23,7 +23,7 @@ from capture4d.errors import InputError
 from capture4d.files.atomic import nan_to_none, write_json
 from capture4d.geometry.mesh import boundary_loops, submesh
 from capture4d.geometry.seams import weld
-from capture4d.mesh_files.meshes import WRITABLE, read_mesh, write_mesh
+from capture4d.mesh_files.meshes import WRITABLE, read_coloured_mesh, read_mesh, write_mesh
 from capture4d.types import Garment, GarmentScan, Mesh
 from capture4d.units import METRES, Units
 from registration.alignment import Similarity, align
@@ -55,6 +55,8 @@ class MeshRegistration:
     """Judged on the normalised problem; all its lengths, those in `reasons` too, are of the files' world."""
     estimated: bool = False
     """The scan came as points alone; its faces are made between them."""
+    notes: tuple[str, ...] = ()
+    """What in the files could not be used, each with the file's name."""
 
 
 def run(
@@ -78,7 +80,8 @@ def run(
         raise InputError(
             f"expected a mesh file ({', '.join(WRITABLE)}), found '{output_path.suffix}'", where=output_path
         )
-    template_file, scan_file = read_mesh(template_path), read_mesh(scan_path, faces_needed=False)
+    read_scan = read_coloured_mesh if config.boundary_colour else read_mesh
+    template_file, scan_file = read_mesh(template_path), read_scan(scan_path, faces_needed=False)
     result = register_mesh(
         template_file.mesh,
         scan_file.mesh,
@@ -105,7 +108,8 @@ def run(
             "cpu_s": round(time.process_time() - begin, 4),
         },
     )
-    return result
+    noted = ((template_path, template_file), (scan_path, scan_file))
+    return replace(result, notes=tuple(f"{path}: {note}" for path, found in noted for note in found.notes))
 
 
 def register_mesh(

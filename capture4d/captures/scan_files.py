@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -148,6 +148,8 @@ class Surface:
     """sRGB per vertex."""
     estimated: bool
     """The file has points alone; the faces are made between them."""
+    notes: tuple[str, ...] = ()
+    """What in the file could not be used."""
 
 
 def read_surface(path: Path) -> Surface:
@@ -162,7 +164,7 @@ def read_surface(path: Path) -> Surface:
         raise InputError(f"cannot be read ({error.strerror or one_line(error)})", where=path) from error
     try:
         _require_extent(found.mesh)
-        return whole_surface(found.mesh, found.colours)
+        return replace(whole_surface(found.mesh, found.colours), notes=found.notes)
     except InputError as error:
         raise error.at(path) from None
 

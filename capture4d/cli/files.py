@@ -50,6 +50,8 @@ class Template(MeshOptions):
         config = TemplateConfig(self.frame, self.region, self.uv, self.names, self.units)
         result = pipeline.template(self.mesh, self.output, config, body=self.body, poses=self.poses)
         garment, report = result.garment, result.report
+        for note in result.notes:
+            print(f"capture4d: {self.mesh}: {note}", file=sys.stderr)
         loops = ", ".join(f"{name} ({len(loop)})" for name, loop in garment.loops.items())
         faults = ", ".join(report.uv.faults())
         cut = f"cut afresh{f' ({faults})' if faults else ''}"
@@ -78,6 +80,8 @@ class RegisterMesh(MeshOptions):
 
         result = pipeline.register_mesh(self.template, self.scan, self.output, self.config)
         print(f"registered: {self.output}, measures: {self.output.with_suffix('.json')}")
+        for note in result.notes:
+            print(f"capture4d: {note}", file=sys.stderr)
         if result.estimated:
             print(f"capture4d: {self.scan}: points without faces; normals and faces are estimated", file=sys.stderr)
         quality = result.quality

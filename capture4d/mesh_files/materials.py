@@ -88,7 +88,7 @@ def paint_at_vertices(path: Path, painted: Painted) -> tuple[UInt8[np.ndarray, "
     if not known.any():
         return None, notes
     found = mean_at_vertices(faces[known], colours[known], len(painted.found.mesh.vertices))
-    bare = len(found) - len(np.unique(faces[known]))
+    bare = len(np.unique(faces)) - len(np.unique(faces[known]))
     return found, (*notes, f"{bare} of {len(found)} vertices are in no painted face: black") if bare else notes
 
 

@@ -16,7 +16,8 @@ from capture4d.types import Mesh
 
 __all__ = ["off_bytes", "read_off"]
 
-_KEYWORD = re.compile(rb"(ST)?(C)?(N)?(4)?(n)?OFF(?![A-Z])(.*)", re.IGNORECASE)
+_KEYWORD = re.compile(rb"((?:ST|C|N)*)(4)?(n)?OFF(?![A-Z])(.*)", re.IGNORECASE)
+"""Geomview has the letters in the order ST, C, N, MeshLab in another one."""
 _DIGITS = 12
 """Behind the point: a float32 of a micrometre comes back."""
 _COMMENT = re.compile(rb"#[^\n]*")
@@ -33,6 +34,8 @@ class _Head:
     normals: bool = False
     coloured: bool = False
     textured: bool = False
+    colours_first: bool = False
+    """Of what stands behind the coordinates."""
 
 
 def read_off(path: Path) -> MeshFile:
@@ -48,8 +51,8 @@ def read_off(path: Path) -> MeshFile:
         raise InputError(
             f"cut off, expected lines of {head.vertices} vertices and {head.faces} faces, found {len(head.rows)}"
         )
-    colours_from = 6 if head.normals else 3
-    numbers = lines.needed(head.rows[: head.vertices], colours_from + 3 * head.coloured + 2 * head.textured)
+    least = 3 + 3 * head.normals + 3 * head.coloured + 2 * head.textured
+    numbers = lines.needed(head.rows[: head.vertices], least)
     rows = head.rows[head.vertices : head.vertices + head.faces]
     faces = lines.needed(rows)
     first, counts = faces.first[:-1], faces.counts
@@ -66,7 +69,8 @@ def read_off(path: Path) -> MeshFile:
     uv = _ends(numbers)[corners.clip(0, head.vertices - 1)] if head.textured and head.vertices else None
     found, _ = polygon_mesh(numbers.columns(3), corners, sizes, uv)
     if head.coloured:
-        colours, notes = colour_bytes(numbers.flat[numbers.first[:-1, None] + colours_from + np.arange(3)])
+        behind = 6 if head.normals and not (head.colours_first and _colours_before_normals(numbers)) else 3
+        colours, notes = colour_bytes(numbers.flat[numbers.first[:-1, None] + behind + np.arange(3)])
     else:
         colours, notes = _of_faces(found, faces, sizes)
     return replace(found, colours=colours, notes=found.notes + notes)
@@ -76,10 +80,10 @@ def _head(lines: TextLines) -> _Head:
     rows = lines.filled
     line = lines.line(int(rows[0])).strip() if len(rows) else b""
     keyword = _KEYWORD.fullmatch(line)
-    rest = (keyword[6] if keyword else line).strip()
+    rest = (keyword[4] if keyword else line).strip()
     if keyword and rest.upper().startswith(b"BINARY"):
         raise InputError("expected an OFF file of text, found a binary one")
-    if keyword and (keyword[4] or keyword[5] == b"n"):
+    if keyword and (keyword[2] or keyword[3] == b"n" or (keyword[1].endswith(b"n") and b"OFF" in line)):
         raise InputError(f"expected three dimensions, found '{line[:20].decode('utf-8', 'replace')}'")
     rows = rows[1:]
     if keyword and not rest and len(rows):
@@ -93,8 +97,25 @@ def _head(lines: TextLines) -> _Head:
         raise InputError(
             f"not an OFF file, expected {wanted}, found '{rest[:40].decode('utf-8', 'replace')}'"
         ) from None
-    flags = (False, False, False) if keyword is None else tuple(keyword[which] is not None for which in (3, 2, 1))
-    return _Head(int(counts[0]), int(counts[1]), rows, *flags)
+    letters = re.findall("ST|C|N", keyword[1].decode().upper()) if keyword else []
+    return _Head(
+        int(counts[0]),
+        int(counts[1]),
+        rows,
+        normals="N" in letters,
+        coloured="C" in letters,
+        textured="ST" in letters,
+        colours_first=letters[:2] == ["N", "C"],
+    )
+
+
+def _colours_before_normals(numbers: Numbers) -> bool:
+    """MeshLab writes NCOFF, and then colours before normals; others who write NCOFF mean what it says.
+
+    The normal is the one of length 1.
+    """
+    one = numbers.flat[numbers.first[:-1, None] + 3 + np.arange(3)]
+    return not bool((np.abs(np.linalg.norm(one, axis=1) - 1) < 0.01).mean() > 0.5)
 
 
 def _ends(numbers: Numbers) -> np.ndarray:

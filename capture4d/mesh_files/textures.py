@@ -100,6 +100,6 @@ def of_faces_at_vertices(
         return None, ()
     corners = np.repeat(colours[known], 3, axis=0)
     count = len(mesh.vertices)
-    bare = count - len(np.unique(mesh.faces[known]))
+    bare = len(np.unique(mesh.faces)) - len(np.unique(mesh.faces[known]))
     notes = (f"{bare} of {count} vertices are in no coloured face: black",) if bare else ()
     return mean_at_vertices(mesh.faces[known].reshape(-1), corners, count), notes

@@ -249,6 +249,7 @@ def _measure_run(measures: _Measures, job: _Job) -> tuple[list[FrameStatistics],
             body = body + np.array([0, measures.poses_lift_m, 0])
         frame = measure_frame(scan, measures.paints, rig=measures.rig, body=body, has_colours=colours is not None)
         frame = replace(frame, time_s=time_stamp(file), estimated=found.estimated)
+        frame = replace(frame, notes=tuple(f"{file}: {note}" for note in found.notes))
         if before is not None:
             frame = replace(frame, shift_m=surface_shift(before[1], mesh), shift_from=before[0])
         statistics.append(frame)

@@ -76,6 +76,8 @@ class FrameStatistics:
     """Time stamp in the file."""
     estimated: bool = False
     """The file has points alone."""
+    notes: tuple[str, ...] = ()
+    """The file's name and what in it could not be used."""
 
 
 def measure_frame(

@@ -40,7 +40,7 @@ def judge(
     if survey is not None:
         checks += _check_survey(survey, facts, limits)
     if frames:
-        checks += _check_rate(facts, frames, limits)
+        checks += [_check_notes(frames), *_check_rate(facts, frames, limits)]
         checks += _check_surface(facts, frames, limits)
         checks += _check_colours(facts, frames, limits)
         checks += _check_poses(facts, survey, frames, limits)
@@ -67,6 +67,13 @@ def _check_bad(bad_frames: Sequence[BadFrame]) -> Iterator[Finding]:
 
 _CERTAIN = 10.0
 """Score of what is a fact, not a measurement; others are cut off here."""
+
+
+def _check_notes(frames: Sequence[FrameStatistics]) -> Finding:
+    noted = [frame for frame in frames if frame.notes]
+    first = f", first: {'; '.join(noted[0].notes)}" if noted else ""
+    text = f"something in the files of {_count(noted)} of {len(frames)} could not be used{first}"
+    return Finding("frame-in-part", text, _CERTAIN * bool(noted), tuple(frame.frame_id for frame in noted))
 
 
 def _check_numbers(facts: TakeFacts) -> Iterator[Finding]:

@@ -30,6 +30,8 @@ class TemplateResult(StageResult):
 
     garment: Garment
     report: TemplateReport
+    notes: tuple[str, ...] = ()
+    """What in the mesh's file could not be used."""
 
 
 def run(
@@ -60,13 +62,16 @@ def run(
     if mesh is None:
         assert config.region is not None
         posed = _at_rest(wearer, posed.shaped.shape)
-        surface, source = body_region(posed.shaped, config.region), f"region {config.region}"
+        surface, source, notes = body_region(posed.shaped, config.region), f"region {config.region}", ()
     else:
-        surface, source = read_mesh(mesh).mesh, str(mesh)
+        found = read_mesh(mesh)
+        surface, source, notes = found.mesh, str(mesh), found.notes
         surface = surface.with_vertices(surface.vertices * np.float32(METRES[config.mesh_units]))
     garment, report = make_template(surface, posed, uv=config.uv, names=config.loop_names, source=source)
     save_garment(output, garment)
-    return TemplateResult(output, file_digest([output], root=output.parent), garment=garment, report=report)
+    return TemplateResult(
+        output, file_digest([output], root=output.parent), garment=garment, report=report, notes=notes
+    )
 
 
 def _posed(body: Body, poses: Path | None, frame: int | None) -> PosedBody:

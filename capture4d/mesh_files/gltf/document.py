@@ -18,9 +18,9 @@ from urllib.parse import unquote, unquote_to_bytes
 import numpy as np
 
 from capture4d.errors import InputError
-from capture4d.files.reading import companion
 from capture4d.mesh_files.gltf.compression import MESHOPT, meshopt_bytes
 from capture4d.mesh_files.gltf.entries import count_of, extension
+from capture4d.mesh_files.materials import companion_anyhow
 
 __all__ = ["MOST", "Document", "open_document"]
 
@@ -110,11 +110,13 @@ class Document:
 
     def beside(self, kind: str, uri: str) -> Path:
         """The file that a buffer or an image is in."""
-        plain = uri.replace("\\", "/")
+        if re.match("(?!file:)[a-z][a-z0-9+.-]+://", uri, re.IGNORECASE):
+            raise InputError(f"expected the name of a file, found '{uri[:80]}'")
+        plain = re.sub("^file://+", "/", uri, flags=re.IGNORECASE)
         faults: list[InputError] = []
         for name in dict.fromkeys((unquote(plain), plain)):  # some programs write names as they are
             try:
-                return companion(self.path, name, "buffer" if kind == "buffers" else "texture")
+                return companion_anyhow(self.path, name, "buffer" if kind == "buffers" else "texture")
             except InputError as fault:
                 faults.append(fault)
         raise faults[0]

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from capture4d.errors import InputError
 from capture4d.extraction.garment import painted_border
@@ -76,6 +77,29 @@ def test_painted_borders_are_measured(garment, scan_of, quick) -> None:
         config=replace(quick, boundary_colour="ffd200", units="m"),
     )
     assert result.quality.numbers["boundary_mean_mm"] < 4
+
+
+def test_paint_may_be_in_a_texture(garment, scan_of, quick, tmp_path: Path) -> None:
+    scan = scan_of(swell).mesh
+    height = scan.vertices[:, 1] - scan.vertices[:, 1].min()
+    v = (height / height.max())[scan.faces]
+    picture = np.full((200, 4, 3), (47, 98, 201), np.uint8)
+    picture[:6] = picture[-6:] = PAINT
+    Image.fromarray(picture).save(tmp_path / "t.png")
+    write_mesh(tmp_path / "template.obj", garment.template)
+    write_mesh(tmp_path / "scan.obj", Mesh(scan.vertices, scan.faces, np.stack([0 * v + 0.5, v], axis=2)))
+    (tmp_path / "scan.mtl").write_text("newmtl a\nmap_Kd t.png\n")
+    text = (tmp_path / "scan.obj").read_text()
+    (tmp_path / "scan.obj").write_text("mtllib scan.mtl\nusemtl a\n" + text)
+    painted = replace(quick, boundary_colour="ffd200", units="m")
+    files = tmp_path / "template.obj", tmp_path / "scan.obj", tmp_path / "out.ply"
+    result = run(*files, painted, find_border=painted_border)
+    assert result.quality.numbers["boundary_mean_mm"] < 4
+    assert result.notes == ()
+    # A face of another material, which no file has.
+    (tmp_path / "scan.obj").write_text("mtllib scan.mtl\nusemtl a\n" + text + "usemtl b\nf 1/1 2/2 3/3\n")
+    noted = run(*files, painted, find_border=painted_border).notes
+    assert noted == (f"{tmp_path / 'scan.obj'}: no material 'b' in scan.mtl",)
 
 
 def test_alignment_comes_first_when_asked_for(garment, scan_of, quick) -> None:

@@ -225,6 +225,8 @@ def test_faces_without_paint_are_black_and_noted(folder: Path):
     assert found.colours is not None
     assert [tuple(row) for row in found.colours[::3].tolist()] == [BLACK, RED, BLACK]
     assert found.notes == ("no material 'nobody' in x.mtl", "6 of 9 vertices are in no painted face: black")
+    (folder / "x.obj").write_text(obj("usemtl a") + "v 9 9 9\n")
+    assert read_coloured_mesh(folder / "x.obj").notes == (), "a vertex in no face at all needs no paint"
 
 
 def test_a_name_may_differ_in_its_case_alone(folder: Path):

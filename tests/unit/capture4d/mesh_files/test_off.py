@@ -47,6 +47,7 @@ SPELLINGS = {
     "tabs and indents": off().replace(" ", "\t").replace("\n", "\n  "),
     "byte order mark": "\ufeff" + off(),
     "normals": off("NOFF", NORMALS),
+    "normals in small letters": off("noff", NORMALS),
     "lines behind": off() + "what is this\n",
     "numbers behind vertices": off("OFF", ["9"] * 5),
     "an index of a colour": off(faces=[f"{face} 7" for face in FACES]),
@@ -76,13 +77,15 @@ def test_trimesh_agrees(name: str, tmp_path: Path):
     "text",
     [
         off("COFF", WHOLE), off("COFF", UNIT), off("COFF", WHOLE, ["255"] * 5), off("COFF", UNIT, ["1.0"] * 5),
+        off("NCOFF", NORMALS, WHOLE), off("NCOFF", WHOLE, ["255"] * 5, NORMALS),
+        off("NCSTOFF", WHOLE, ["255"] * 5, NORMALS, UV), off("CSTOFF", WHOLE, UV),
         off("CNOFF", NORMALS, WHOLE), off("STCOFF", WHOLE, ["255"] * 5, UV), off("STCNOFF", NORMALS, UNIT, UV),
     ],
 )  # fmt: skip
 def test_colours_of_vertices(text: str, tmp_path: Path):
     found = read(tmp_path, text)
     np.testing.assert_array_equal(found.colours, BYTES)
-    assert (found.mesh.uv is not None) == text.startswith("ST")
+    assert (found.mesh.uv is not None) == ("ST" in text[: text.index("OFF")])
 
 
 @pytest.mark.parametrize("text", [off("STOFF", UV), off("STNOFF", NORMALS, UV)])
@@ -101,6 +104,8 @@ def test_colours_of_faces_are_the_mean_at_a_vertex(colours: tuple[str, str], tmp
     assert some.colours is not None
     assert some.colours[[0, 1]].tolist() == [[0, 0, 0], [100, 110, 120]]
     assert some.notes == ("2 of 5 vertices are in no coloured face: black",)
+    loose = off(counts="\n6 2 0\n", faces=["9 9 9", *(f"{face} {colours[0]}" for face in FACES)])
+    assert read(tmp_path, loose).notes == (), "a vertex in no face at all needs no colour"
 
 
 @pytest.mark.parametrize(

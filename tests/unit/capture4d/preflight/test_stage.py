@@ -270,6 +270,7 @@ def test_sound_frames_are_judged_sound_at_any_regular_step():
         ({"area_m2": 0.8}, "frame-partial"),
         ({"content": "1"}, "frame-repeated"),
         ({"colours": None}, "colours-missing"),
+        ({"notes": ("scans/000005.obj: 3 corners have no UVs",)}, "frame-in-part"),
         ({"pose_distance_m": 0.08}, "poses-mismatch"),
     ],
 )
@@ -507,6 +508,23 @@ def test_nothing_there_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture
             main(["check", str(folder)])
         assert exit_.value.code == 1
         assert said in capsys.readouterr().err
+
+
+def test_what_could_not_be_used_of_a_file_is_told(
+    sound: dict[int, Scan], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    take = write(tmp_path / "take", sound)
+    scan, target = take / "scans" / "000012.ply", take / "scans" / "000012.obj"
+    found = read_coloured_mesh(scan)
+    scan.unlink()
+    write_mesh(target, found.mesh, colours=found.colours)
+    first, _, rest = target.read_text().partition("\n")
+    target.write_text(" ".join([*first.split()[:4], "nan", "nan", "nan"]) + "\n" + rest)
+    code, report = check(capsys, take)
+    (finding,) = report["findings"]
+    assert (code, finding["code"], finding["severity"], finding["frames"]) == (0, "frame-in-part", "warning", [12])
+    count = len(found.mesh.vertices)
+    assert f"000012.obj: 1 of {count} colours are no numbers: black" in finding["found"]
 
 
 @pytest.mark.parametrize("borders", [None, {"../x": "ffc400"}])

@@ -97,6 +97,15 @@ def test_buffers_lie_inside_or_beside_a_text_file(name: str, tmp_path: Path) -> 
         require_sheet(file.save(tmp_path / "x.gltf", uri=uri))
 
 
+@pytest.mark.parametrize(
+    "uri", ["X.BIN", "./x.bin", "file:///home/ana/x.bin", "file://x.bin", "C:\\Users\\ana\\x.bin", "/home/ana/X.bin"]
+)
+def test_a_name_from_another_machine_is_the_file_beside_it(uri: str, tmp_path: Path) -> None:
+    file = sheet()
+    (tmp_path / "x.bin").write_bytes(bytes(file.data))
+    require_sheet(file.save(tmp_path / "x.gltf", uri=uri))
+
+
 def test_a_name_with_a_per_cent_sign_and_the_name_that_it_stands_for(tmp_path: Path) -> None:
     """What is meant by the standard goes before what some programs write."""
     file = sheet()
@@ -146,8 +155,9 @@ def test_a_file_is_told_by_its_beginning(tmp_path: Path) -> None:
         ("C:\\x.bin", "expected the buffer beside it"),
         ("x%00.bin", "expected the name of a buffer"),
         ("none.bin", "none.bin: no such file, the buffer of x.gltf"),
-        ("file:///etc/passwd", "no such file, the buffer of x.gltf"),
-        ("https://example.com/x.bin", "no such file, the buffer of x.gltf"),
+        ("file:///etc/passwd", "expected the buffer beside it"),
+        ("file:///../x.bin", "expected the buffer beside it"),
+        ("https://example.com/x.bin", "expected the name of a file, found 'https://example.com/x.bin'"),
         ("inner", "no such file, the buffer of x.gltf"),
     ],
 )
