@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from capture4d.captures.scan_files import KINDS, list_scans
 from capture4d.errors import InputError
 from capture4d.files.arrays import ArrayFile
 from capture4d.files.atomic import file_digest
-from capture4d.mesh_files.meshes import READABLE, read_mesh
+from capture4d.mesh_files.meshes import read_mesh
 from capture4d.types import Mesh
 
 __all__ = ["MeshSequence", "open_sequence"]
@@ -53,12 +53,12 @@ class MeshSequence:
 
 
 def open_sequence(path: Path) -> MeshSequence:
-    """Find the frames of a sequence. A file's frame number is the last number in its name.
+    """Find the frames of a sequence, by the names that a capture's scans have.
 
     Raises:
         InputError: there is nothing, or the names do not tell the frames apart.
     """
-    if path.is_file() and path.suffix == ".npz":
+    if path.is_file() and path.suffix.lower() == ".npz":
         with ArrayFile(path) as arrays:
             vertices, faces = arrays["vertices"], arrays["faces"]
             shape = vertices.shape
@@ -70,16 +70,10 @@ def open_sequence(path: Path) -> MeshSequence:
     if not path.is_dir():
         found = "a file" if path.exists() else "nothing"
         raise InputError(f"expected a folder of mesh files or an npz, found {found}", where=path)
-    files: dict[int, Path] = {}
-    for file in sorted(path.iterdir()):
-        if file.suffix.lower() not in READABLE:
-            continue
-        numbers = re.findall(r"\d+", file.stem)
-        if not numbers:
-            raise InputError("expected a frame number in the name, found none", where=file)
-        other = files.setdefault(int(numbers[-1]), file)
-        if other != file:
-            raise InputError(f"has the frame number {int(numbers[-1])} of {other.name}", where=file)
-    if not files:
-        raise InputError(f"expected mesh files ({', '.join(READABLE)}), found none", where=path)
-    return MeshSequence(path, dict(sorted(files.items())))
+    found = list_scans(path, companions_below=False)
+    for number, others in found.also.items():
+        raise InputError(f"has the frame number {number} of {found.scans[number].name}", where=others[0])
+    if not found.scans:
+        kinds = ", ".join(KINDS)
+        raise InputError(f"expected mesh files with a frame number in their names ({kinds}), found none", where=path)
+    return MeshSequence(path, found.scans)

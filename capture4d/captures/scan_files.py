@@ -92,7 +92,11 @@ def _files(folder: Path, *, below: bool, seen: frozenset[str] = frozenset()) -> 
         for entry in entries:
             if entry.name.startswith("."):
                 continue
-            if not entry.is_dir():
+            try:
+                is_folder = entry.is_dir()
+            except OSError:  # a link that leads in a circle
+                is_folder = False
+            if not is_folder:
                 yield folder / entry.name
             elif below:
                 yield from _files(folder / entry.name, below=True, seen=seen | {place})

@@ -64,7 +64,7 @@ class Scan(StageOptions, MeshOptions):
     """Scan your own mesh sequence with the virtual camera rig: a capture folder, with truth if the faces stay."""
 
     meshes: Annotated[Positional[Path], arg(metavar="MESHES")]
-    """Folder of mesh files, one per frame, in order of the last number in their names; or .npz with vertices (T, V, 3)
+    """Folder of mesh files, one per frame, named as the scans of a capture; or .npz with vertices (T, V, 3)
     and faces (F, 3)."""
     output: Annotated[Positional[Path], arg(metavar="OUTPUT")]
     """Capture folder to write."""

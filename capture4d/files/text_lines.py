@@ -42,12 +42,14 @@ def plain_text(data: bytes) -> bytes:
     r"""Text without a byte order mark, every line of it ended by \n.
 
     Raises:
-        InputError: it is UTF-16.
+        InputError: it is UTF-16, or no text.
     """
     head = data[:256]
-    nuls = max(head[::2].count(0), head[1::2].count(0))
-    if head[:2] in (b"\xff\xfe", b"\xfe\xff") or nuls > len(head) // 4:
+    nuls = sorted((head[::2].count(0), head[1::2].count(0)))
+    if head[:2] in (b"\xff\xfe", b"\xfe\xff") or (nuls[1] > len(head) // 4 and nuls[0] <= len(head) // 16):
         raise InputError("expected UTF-8, found UTF-16 text")
+    if nuls[1] > len(head) // 4:
+        raise InputError("expected a text, found other bytes")
     data = data.removeprefix(b"\xef\xbb\xbf")
     if b"\r" in data:
         data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")

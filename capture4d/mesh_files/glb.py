@@ -38,20 +38,21 @@ def _read(path: Path, *, pictures: bool) -> MeshFile:
     if not surfaces:
         return MeshFile(Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)))
     firsts = np.cumsum([0, *(len(surface.vertices) for surface in surfaces)])
+    uv, notes = _corner_uv(document, surfaces)
     mesh = Mesh(
         np.concatenate([surface.vertices for surface in surfaces]),
         np.concatenate([surface.faces + np.int32(first) for surface, first in zip(surfaces, firsts, strict=False)]),
-        _corner_uv(document, surfaces),
+        uv,
     )
-    return MeshFile(mesh, base_colours(document, surfaces, pictures=pictures))
+    return MeshFile(mesh, base_colours(document, surfaces, pictures=pictures), notes=notes)
 
 
-def _corner_uv(document: Document, surfaces: list[Primitive]) -> np.ndarray | None:
-    """UVs at the corners of all faces, if every surface has them and all are numbers."""
-    corners = []
-    for surface in surfaces:
-        uv = texture_coordinates(document, surface)
-        if uv is None or not np.isfinite(uv := uv.astype(np.float32)).all():
-            return None
-        corners.append(uv[surface.faces])
-    return np.concatenate(corners)
+def _corner_uv(document: Document, surfaces: list[Primitive]) -> tuple[np.ndarray | None, tuple[str, ...]]:
+    """UVs at the corners of all faces, if every surface has them and all are numbers; a note if some are none."""
+    found = [texture_coordinates(document, surface) for surface in surfaces]
+    there = [
+        uv.astype(np.float32)[surface.faces] for uv, surface in zip(found, surfaces, strict=True) if uv is not None
+    ]
+    bad = sum(not np.isfinite(corners).all() for corners in there)
+    notes = (f"{bad} of {len(surfaces)} surfaces have UVs that are no numbers: the mesh is without",) if bad else ()
+    return (None if bad or len(there) < len(surfaces) else np.concatenate(there)), notes

@@ -106,7 +106,7 @@ def _header(data: bytes) -> _Header:
     end = _END.search(data, start) if b"end_header" in data else None
     lines = _LINE.split(decoded(data[start : end.start() if end else 65_536]))
     if lines[0].strip().lower() != "ply":
-        raise InputError("not a PLY file, expected it to begin with 'ply'")
+        raise InputError(f"not a PLY file, expected it to begin with 'ply', found {data[:16]!r}")
     if end is None:
         raise InputError("cut off in the header")
     elements: dict[str, Element] = {}

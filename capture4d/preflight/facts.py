@@ -38,11 +38,11 @@ class TakeFacts:
     border_names: tuple[tuple[str, ...], ...] = ()
     """Names of the borders of each paint."""
     frame_ids: tuple[int, ...] = ()
-    """All frame numbers with a file, ascending."""
+    """All frame numbers with a file that the stages take, ascending."""
     listed: tuple[int, ...] | None = None
     """Frames that the description names."""
     dropped: tuple[int, ...] = ()
-    """Frames that the description says were left out."""
+    """Frames that the description says, or by its list of frames shows, were left out."""
     duplicated: tuple[int, ...] = ()
     """Frame numbers with more than one file."""
     pose_frames: tuple[int, ...] | None = None

@@ -21,9 +21,10 @@ Code = Literal[
     "frame-unreadable",
     "frame-empty",
     "frame-nan",
-    "frame-in-part",
+    "read-in-part",
     "frame-partial",
     "frame-repeated",
+    "frames-listed",
     "frames-missing",
     "frames-duplicated",
     "fps",
@@ -52,12 +53,13 @@ ADVICE: Mapping[Code, tuple[Severity, str]] = {
     "frame-unreadable": ("error", "copy or reconstruct these frames again; --fix leaves them out"),
     "frame-empty": ("error", "reconstruct these frames again; --fix leaves them out"),
     "frame-nan": ("error", "reconstruct these frames again; --fix leaves them out"),
-    "frame-in-part": (
+    "read-in-part": (
         "warning",
         "see whether what could not be used matters; if it does, export these frames again",
     ),
     "frame-partial": ("warning", "look at these frames: cameras may have dropped out; --fix leaves them out"),
     "frame-repeated": ("warning", "the recorder stalled; --fix leaves the copies out"),
+    "frames-listed": ("error", "find these scans, or take the numbers out of frames in capture.json, as --fix does"),
     "frames-missing": ("warning", "find the frames, or accept the gap, as --fix does; times follow from frame numbers"),
     "frames-duplicated": (
         "error",

@@ -155,7 +155,8 @@ def _description(checked: Checked, written: list[int], output: Path) -> dict[str
         fps = checked.rate
     if fps is not None:
         description["fps"] = fps
-    missing = next((f.frames for f in checked.verdict.findings if f.code == "frames-missing"), ())
+    absent = ("frames-missing", "frames-listed")
+    missing = {number for found in checked.verdict.findings if found.code in absent for number in found.frames}
     dropped = {*take.facts.dropped, *missing, *take.files} - set(written)
     return {**description, "dropped_frames": sorted(dropped)}
 

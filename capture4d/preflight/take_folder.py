@@ -17,12 +17,11 @@ from capture4d.body.anny import load_anny
 from capture4d.body.posed_surface import BodyState, TrackedBody, tracked_body
 from capture4d.body.skinning import ShapedBody, pose_frame, with_shape
 from capture4d.captures.description import Description, parse_description
-from capture4d.captures.scan_files import Surface, list_scans, read_surface
+from capture4d.captures.scan_files import KINDS, Surface, list_scans, read_surface
 from capture4d.colours.spaces import Colour, parse_colour
 from capture4d.errors import EmptyMeshError, InputError, NotFiniteError
 from capture4d.files.atomic import read_json
 from capture4d.files.records import load_body, load_poses, load_rig
-from capture4d.mesh_files.meshes import READABLE
 from capture4d.preflight.facts import BadFrame, Paints, TakeFacts
 from capture4d.types import PoseSequence, Rig
 from capture4d.units import METRES
@@ -53,7 +52,7 @@ class TakeFolder:
 
     path: Path
     files: Mapping[int, Path]
-    """One scan per frame number, ascending."""
+    """One scan per frame number, ascending: those that the stages take."""
     also: Mapping[int, tuple[Path, ...]]
     """Further files with a number that has one already."""
     description: Mapping[str, Any]
@@ -88,8 +87,15 @@ def open_take(path: Path, claims: Claims | None = None) -> TakeFolder:
     folder = path / "scans" if (path / "scans").is_dir() else path
     found = list_scans(folder, claims.frames, companions_below=False)
     if not found.scans:
-        wanted = claims.frames or f"files with a frame number ({', '.join(READABLE)})"
-        raise InputError(f"expected scans named {wanted}, found none", where=folder)
+        named = (
+            f"named {claims.frames}" if claims.frames else f"with a frame number in their names ({', '.join(KINDS)})"
+        )
+        raise InputError(f"expected scans {named}, found none", where=folder)
+    unlisted = set() if claims.frames or said.frames is None else set(found.scans) - set(said.frames)
+    files = {number: scan for number, scan in found.scans.items() if number not in unlisted}
+    also = {number: others for number, others in found.also.items() if number in files}
+    if not files:
+        raise InputError(f"expected scans of the frames in capture.json, found {len(unlisted)} others", where=folder)
     poses_path, body_path = (
         given or (path / name if (path / name).is_file() else None)
         for given, name in ((claims.poses, "poses.npz"), (claims.body, "body.npz"))
@@ -97,9 +103,10 @@ def open_take(path: Path, claims: Claims | None = None) -> TakeFolder:
     rig_path = claims.rig or (path / "rig.json" if (path / "rig.json").is_file() else None)
     rig = load_rig(rig_path) if rig_path else None
     poses = load_poses(poses_path) if poses_path else None
-    facts = replace(_facts(said, claims, tuple(found.scans), poses), duplicated=tuple(found.also))
+    facts = _facts(said, claims, tuple(files), poses)
+    facts = replace(facts, duplicated=tuple(also), dropped=tuple(sorted({*facts.dropped, *unlisted})))
     moving = poses is not None and (body_path is not None or poses.joint_names == load_anny().joint_names)
-    return TakeFolder(path, found.scans, found.also, description, facts, rig, poses_path, body_path, moving, claims)
+    return TakeFolder(path, files, also, description, facts, rig, poses_path, body_path, moving, claims)
 
 
 def _kind(path: Path) -> str:

@@ -73,12 +73,15 @@ def _check_notes(frames: Sequence[FrameStatistics]) -> Finding:
     noted = [frame for frame in frames if frame.notes]
     first = f", first: {'; '.join(noted[0].notes)}" if noted else ""
     text = f"something in the files of {_count(noted)} of {len(frames)} could not be used{first}"
-    return Finding("frame-in-part", text, _CERTAIN * bool(noted), tuple(frame.frame_id for frame in noted))
+    return Finding("read-in-part", text, _CERTAIN * bool(noted), tuple(frame.frame_id for frame in noted))
 
 
 def _check_numbers(facts: TakeFacts) -> Iterator[Finding]:
     present = np.array(facts.frame_ids, np.int64)
     absent = set(facts.listed or ()) - set(facts.frame_ids)
+    without = f"no scan for {_count(absent)} of the {len(facts.listed or ())} in capture.json" if absent else "none"
+    yield Finding("frames-listed", without, _CERTAIN * bool(absent), _sorted(absent))
+    listed, absent = absent, set[int]()
     if len(present) > 2:
         steps = np.diff(present)
         step = int(np.bincount(steps).argmax()) if steps.max() < 1_000_000 else int(np.median(steps))
@@ -91,7 +94,7 @@ def _check_numbers(facts: TakeFacts) -> Iterator[Finding]:
         # Irregular numbers are a hand-picked selection; regular ones with gaps are not.
         if (steps == step).mean() >= 0.5:
             absent |= regular
-    absent -= set(facts.dropped)
+    absent -= {*facts.dropped, *listed}
     if absent:
         yield Finding("frames-missing", f"{_count(absent)} of {len(present) + len(absent)}", _CERTAIN, _sorted(absent))
     else:

@@ -158,7 +158,7 @@ def open_document(path: Path) -> Document:
     data = path.read_bytes()
     text, binary = _chunks(data) if data[:4] == b"glTF" else (data, b"")
     if data[:4] != b"glTF" and data.lstrip(b"\xef\xbb\xbf \t\r\n")[:1] != b"{":
-        raise InputError("not a readable GLB file, cut off, or something else under this name")
+        raise InputError(f"not a readable GLB file, cut off, or something else: begins with {data[:16]!r}")
     try:
         tree = json.loads(text.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:

@@ -233,6 +233,11 @@ def test_bad_sequences_are_named(tmp_path):
     write_mesh(tmp_path / "names" / "b_1.obj", skirt())
     with pytest.raises(InputError, match="frame number 1"):
         open_sequence(tmp_path / "names")
+    for name in ("._a_1.obj", "Thumbs 3.db"):
+        (tmp_path / "names" / name).write_bytes(b"")
+    (tmp_path / "names" / "b_1.obj").rename(tmp_path / "names" / "a_2_v2.OBJ")
+    write_mesh(tmp_path / "names" / "a_3_v2.obj", skirt())
+    assert open_sequence(tmp_path / "names").frame_ids == (1, 2, 3), "as the scans of a capture"
     np.savez(tmp_path / "flat.npz", vertices=np.zeros((4, 3), np.float32), faces=np.zeros((1, 3), np.int32))
     with pytest.raises(InputError, match="shape"):
         open_sequence(tmp_path / "flat.npz")

@@ -95,6 +95,7 @@ def test_numbers_beyond_int32_are_said(tmp_path: Path):
 def test_folders_pipes_and_broken_links_are_no_scans(tmp_path: Path):
     folder = capture_with(tmp_path, "000001.ply", "000004.ply/within.txt")
     (folder / "scans" / "000002.ply").symlink_to("nowhere.ply")
+    (folder / "scans" / "000009.ply").symlink_to("000009.ply")
     os.mkfifo(folder / "scans" / "000003.ply")
     (folder / "scans" / "again").symlink_to(folder / "scans")
     assert list(list_scans(folder / "scans").scans) == [1]

@@ -77,3 +77,13 @@ def test_units_and_places_do_not_matter_and_points_keep_their_numbers():
 def test_what_is_no_surface_is_said(points: np.ndarray, said: str):
     with pytest.raises(InputError, match=said):
         faces_between(points)
+
+
+def test_points_that_crowd_around_places_are_passed_over_and_others_are_not():
+    """The ball would try every two of hundreds that it touches: minutes for what some 100 kB say."""
+    points = np.random.default_rng(0).standard_cauchy((6000, 3)).astype(np.float32)
+    assert len(np.unique(faces_between(points))) < len(points) / 2
+    dense = sphere()[sphere()[:, 0] > 0]
+    uneven = np.concatenate([dense, sphere()[:500] * [-1, 1, 1]]).astype(np.float32)  # half of it four times as dense
+    front = np.unique(faces_between(uneven))
+    assert np.isin(np.arange(len(dense)), front).mean() > 0.97

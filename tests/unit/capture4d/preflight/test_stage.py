@@ -18,6 +18,7 @@ from capture4d.captures.capture import read_capture, read_frame
 from capture4d.captures.placement import Placement, place, place_rig
 from capture4d.cli.main import main
 from capture4d.colours.spaces import to_lab
+from capture4d.errors import InputError
 from capture4d.files.atomic import write_json
 from capture4d.files.records import load_poses, save_body, save_poses
 from capture4d.mesh_files.meshes import read_coloured_mesh, read_mesh, write_mesh
@@ -35,7 +36,7 @@ from capture4d.preflight.statistics import (
     surface_shift,
 )
 from capture4d.preflight.survey import find_units
-from capture4d.preflight.take_folder import time_stamp
+from capture4d.preflight.take_folder import open_take, time_stamp
 from capture4d.preflight.verdict import judge
 from capture4d.types import Mesh, Rig, Scan
 from tests.shapes import ring
@@ -270,7 +271,7 @@ def test_sound_frames_are_judged_sound_at_any_regular_step():
         ({"area_m2": 0.8}, "frame-partial"),
         ({"content": "1"}, "frame-repeated"),
         ({"colours": None}, "colours-missing"),
-        ({"notes": ("scans/000005.obj: 3 corners have no UVs",)}, "frame-in-part"),
+        ({"notes": ("scans/000005.obj: 3 corners have no UVs",)}, "read-in-part"),
         ({"pose_distance_m": 0.08}, "poses-mismatch"),
     ],
 )
@@ -291,7 +292,7 @@ def test_numbers_tell_what_is_missing():
     frames = [frame(number) for number in (2, 4, 6, 10, 12)]
     assert judged(frames) == [("frames-missing", (8,))]
     assert judged(frames, dropped=(8,)) == []
-    assert judged(frames, dropped=(8,), listed=(2, 3)) == [("frames-missing", (3,))]
+    assert judged(frames, dropped=(8,), listed=(2, 3)) == [("frames-listed", (3,))]
     assert judged(frames, dropped=(8,), duplicated=(4,)) == [("frames-duplicated", (4,))]
     assert judged(frames, dropped=(8,), pose_frames=(2, 4, 6, 10)) == [("poses-missing", (12,))]
 
@@ -510,6 +511,29 @@ def test_nothing_there_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture
         assert said in capsys.readouterr().err
 
 
+def test_the_frames_that_are_listed_are_those_of_the_stages(
+    sound: dict[int, Scan], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """Scans beside them are not looked at, nor written, nor missed."""
+    take = write(tmp_path / "take", sound, frames=[10, 11, 13])
+    (take / "scans" / "000012.ply").write_bytes(b"")
+    (take / "scans" / "14.ply").write_bytes(b"")
+    code, found = check(capsys, take)
+    assert (code, codes(found), found["frames"]) == (0, [], 3)
+    write_mesh(take / "scans" / "13.ply", sound[13].mesh, colours=sound[13].colours)
+    assert codes(check(capsys, take, "--fix")[1]) == ["frames-duplicated"]
+    assert read_capture(take).frame_ids == read_capture(tmp_path / "take-fixed").frame_ids == (10, 11, 13)
+    (take / "scans" / "000011.ply").unlink()
+    finding = next(each for each in check(capsys, take)[1]["findings"] if each["code"] == "frames-listed")
+    assert (finding["severity"], finding["frames"]) == ("error", [11])
+    with pytest.raises(InputError, match=r"000011\.ply: no such scan; 1 of 3 frames"):
+        read_capture(take)
+    for name in ("000010", "000013", "13"):
+        (take / "scans" / f"{name}.ply").unlink()
+    with pytest.raises(InputError, match=r"scans: expected scans of the frames in capture\.json, found 2 others"):
+        open_take(take)
+
+
 def test_what_could_not_be_used_of_a_file_is_told(
     sound: dict[int, Scan], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
@@ -522,9 +546,12 @@ def test_what_could_not_be_used_of_a_file_is_told(
     target.write_text(" ".join([*first.split()[:4], "nan", "nan", "nan"]) + "\n" + rest)
     code, report = check(capsys, take)
     (finding,) = report["findings"]
-    assert (code, finding["code"], finding["severity"], finding["frames"]) == (0, "frame-in-part", "warning", [12])
+    assert (code, finding["code"], finding["severity"], finding["frames"]) == (0, "read-in-part", "warning", [12])
     count = len(found.mesh.vertices)
     assert f"000012.obj: 1 of {count} colours are no numbers: black" in finding["found"]
+    (take / "scans" / "13.ply").write_bytes((take / "scans" / "000013.ply").read_bytes())
+    check(capsys, take, "--fix")
+    assert read_capture(tmp_path / "take-fixed").frame_ids == tuple(sound), "a frame in part is a frame"
 
 
 @pytest.mark.parametrize("borders", [None, {"../x": "ffc400"}])

@@ -233,6 +233,7 @@ def test_uvs_that_are_no_numbers_leave_the_surface(tmp_path: Path) -> None:
     primitive["material"] = file.add("materials", {METAL: {"baseColorTexture": file.texture(picture())}})
     found = read_coloured_mesh(file.save(tmp_path / "x.glb"))
     assert found.mesh.uv is None
+    assert found.notes == ("1 of 1 surfaces have UVs that are no numbers: the mesh is without",)
     assert found.colours is not None
     others = np.arange(16) != 3
     np.testing.assert_array_equal(found.colours[others], PIXELS.reshape(16, 3)[others])
