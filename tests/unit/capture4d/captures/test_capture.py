@@ -33,6 +33,7 @@ from capture4d.colours.spaces import format_colour, parse_colour
 from capture4d.errors import InputError
 from capture4d.files.atomic import write_npz
 from capture4d.files.records import load_body, load_garment, load_rig, save_body, save_garment, save_poses, save_rig
+from capture4d.geometry.mesh import boundary_loops
 from capture4d.mesh_files.meshes import write_mesh
 from capture4d.types import Body, Garment, Mesh, PoseSequence, Scan
 from tests.shapes import tube
@@ -353,7 +354,7 @@ def test_a_bare_template_is_joined_at_its_seams(name: str, capture: Capture):
 
 
 def test_a_template_whose_borders_lead_elsewhere_is_refused(capture: Capture):
-    save_garment(capture.path / "template.npz", Garment(SQUARE, {"../hem": np.array([0, 1, 2, 3], np.int32)}))
+    save_garment(capture.path / "template.npz", Garment(SQUARE, {"../hem": boundary_loops(SQUARE.faces)[0]}))
     with pytest.raises(InputError, match=r"template\.npz: name of a border: expected .*found '\.\./hem'"):
         _ = replace(capture).template
 
