@@ -424,7 +424,6 @@ TRUNK = ("spine1", "spine2", "spine3", "neck1", "neck2", "head")
         dict.fromkeys(TRUNK, RIGHT),  # along X from the spine up, under a pelvis of the world's axes
         dict.fromkeys(TRUNK[:3], RIGHT),
         dict.fromkeys(TRUNK[1:], RIGHT @ TWIST),
-        {"pelvis": RIGHT},
         {"spine3": TWIST},
         {"head": RIGHT},
         {"head": TWIST @ RIGHT},
