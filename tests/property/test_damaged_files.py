@@ -18,8 +18,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.reader_damage import ARRAY_CHANGES, JSON_VALUES, NUMBERS, WORDS, damaged, mutant, with_arrays
-from benchmarks.reader_kinds import BY_NAME, KINDS, Kind, fault_of, laid_out, whole
 from benchmarks.reader_judge import nonsense_in
+from benchmarks.reader_kinds import BY_NAME, KINDS, Kind, fault_of, laid_out, whole
 from benchmarks.reader_rules import RULES
 from benchmarks.reader_values import GARMENT, POSES
 from benchmarks.reader_worker import LONGEST, MEMORY
