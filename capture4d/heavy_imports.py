@@ -1,5 +1,5 @@
-"""Import open3d, warp, pycolmap and numba where they are needed: quietly, and so that they load at all, also where
-neither the code nor the home of the user can be written to."""
+"""Import open3d, warp, anny, pycolmap and numba where they are needed: quietly, and so that they load at all, also
+where neither the code nor the home of the user can be written to."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ import importlib
 import os
 import sys
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 from capture4d.cache import cache_path, kernel_cache, user_cache_folder, usual_cache_path
 
-__all__ = ["import_open3d", "import_pycolmap", "import_warp", "njit"]
+__all__ = ["import_anny", "import_open3d", "import_pycolmap", "import_warp", "njit"]
 
 
 @functools.cache
@@ -47,6 +48,21 @@ def import_warp() -> Any:
         warp.config.log_level = warp.LOG_ERROR  # or it prints each device and each compiled module
         warp.init()
     return warp
+
+
+@functools.cache
+def import_anny() -> Any:
+    """The anny module. It asks for a home as it is loaded, and is told the cache folder by a user without one."""
+    import_warp()
+    try:
+        Path.home()
+    except RuntimeError:  # neither HOME nor an entry among the users
+        os.environ["HOME"] = str(cache_path())
+        try:
+            return importlib.import_module("anny")
+        finally:
+            del os.environ["HOME"]
+    return importlib.import_module("anny")
 
 
 def njit(**options: Any) -> Callable[[Any], Any]:

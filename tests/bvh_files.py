@@ -284,6 +284,8 @@ TOOLS: dict[str, Callable[[str], str]] = {
                            "SHOULDER ARM FOREARM HAND", lambda side, word: side.upper() + word),
     "snake case": names_of("hips spine spine1 spine2 neck neck1 head", "up_leg leg foot toe_base",
                            "shoulder arm fore_arm hand", lambda side, word: f"{side}_{word}"),
+    "mocopi": names_of("root torso_2 torso_4 torso_7 neck_1 neck_2 head", "up_leg low_leg foot toes",
+                       "shoulder up_arm low_arm hand", letter("{s}_{word}")),
     "makehuman": names_of("root spine05 spine03 spine01 neck01 neck02 head", "upperleg01 lowerleg01 foot toe1-1",
                           "clavicle upperarm01 lowerarm01 wrist", letter("{word}.{S}")),
     "maya": names_of("hips_jnt spine_01_jnt spine_02_jnt spine_03_jnt neck_01_jnt neck_02_jnt head_jnt",

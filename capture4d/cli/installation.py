@@ -26,7 +26,8 @@ from packaging.requirements import Requirement
 from capture4d.cache import cache_path, can_write, kernel_cache
 from capture4d.cli.options import all_cores
 
-__all__ = ["Cache", "Diagnosis", "Machine", "Part", "as_json", "as_text", "diagnose", "load_apart", "load_one_by_one"]
+__all__ = ["Cache", "Diagnosis", "Machine", "Part", "as_json", "as_text", "diagnose", "load_apart", "load_one_by_one",
+           "module_of"]  # fmt: skip
 
 State = Literal["found", "missing", "broken", "other version"]
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -34,6 +35,7 @@ OPTIONAL = {"meshmonk": "a peer of `python -m benchmarks registration`"}
 """Distributions that something is better with, and what."""
 CUDA = "`--device cuda` of fit and animate"
 _MODULES = {
+    "dracopy": "DracoPy",
     "libusb-package": "libusb_package",
     "opencv-contrib-python-headless": "cv2",
     "pillow": "PIL",
@@ -166,6 +168,7 @@ def load_one_by_one(names: Sequence[str]) -> None:
     from capture4d import heavy_imports
 
     special = {
+        "anny": heavy_imports.import_anny,
         "open3d": heavy_imports.import_open3d,
         "pycolmap": heavy_imports.import_pycolmap,
         "warp-lang": heavy_imports.import_warp,
@@ -176,11 +179,16 @@ def load_one_by_one(names: Sequence[str]) -> None:
             if name in special:
                 special[name]()
             else:
-                importlib.import_module(_MODULES.get(name, name.replace("-", "_")))
+                importlib.import_module(module_of(name))
             cuda = _cuda_name() if name == "torch" else ""
             _say({"name": name, "fault": "", "cuda": cuda})
         except BaseException as error:  # whatever a broken library raises is the answer
             _say({"name": name, "fault": " ".join(f"{type(error).__name__}: {error}".split())})
+
+
+def module_of(name: str) -> str:
+    """What is imported of a distribution."""
+    return _MODULES.get(name.lower(), name.replace("-", "_"))
 
 
 def _say(answer: dict[str, str]) -> None:

@@ -82,8 +82,9 @@ COMMANDS: Mapping[str, Any] = {
     "doctor": Doctor,
 }
 
-_WRITE_FILES = (Template, RegisterMesh, Calibrate, ConvertBody, ConvertPoses, ConvertRig)
-"""Commands whose output is a file among others; that of the rest is a folder of their own."""
+_WRITE_FILES = (Check, Template, RegisterMesh, Calibrate, ConvertBody, ConvertPoses, ConvertRig)
+"""Commands whose output is a file among others, or a folder that comes to be at the end; that of the rest is a folder
+of their own."""
 
 _PRESETS: Mapping[Any, Mapping[str, Any]] = {
     Synth: synth_config.PRESETS,
@@ -215,12 +216,16 @@ def _alone(command: Any) -> Iterator[None]:
     from capture4d.runs.locks import alone
 
     folder = not isinstance(command, _WRITE_FILES)
-    with alone(output, folder=folder, wait=getattr(command, "wait", False)):
+    with alone(output, folder=folder, wait=getattr(command, "wait", None)):
         yield
 
 
 def _written_by(command: Any) -> Path | None:
     """The folder, or the file, that a command writes to; None if it writes nothing."""
+    if isinstance(command, Check):
+        from capture4d.preflight.fix import fixed_path
+
+        return fixed_path(command.capture) if command.fix else None
     if isinstance(command, Report):
         return command.work / "report" if command.work.is_dir() else None
     if isinstance(command, Fit) and command.output is None:

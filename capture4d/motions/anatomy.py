@@ -73,6 +73,7 @@ _THEIA = _scheme("Theia", "thigh shank foot toes|toe", "clavicle|shoulder uarm l
 _STRETCH = _scheme(
     "Auto-Rig Pro", "thighstretch|thigh legstretch foot toes01", "shoulder armstretch forearmstretch|forearm hand"
 )
+_MOCOPI = _scheme("mocopi", "upleg lowleg foot toes", "shoulder uparm lowarm hand")
 _MAKEHUMAN = _scheme("MakeHuman", "upperleg01 lowerleg01 foot toe11", "clavicle upperarm01 lowerarm01 wrist")
 
 NAMINGS: dict[str, tuple[_Scheme, ...]] = {
@@ -90,6 +91,7 @@ NAMINGS: dict[str, tuple[_Scheme, ...]] = {
     "blender": (_BLENDER, _STRETCH),
     "daz": (_DAZ,),
     "vicon": (_BEAT, _THEIA, _HUMANIK),
+    "mocopi": (_MOCOPI,),
     "makehuman": (_MAKEHUMAN,),
 }
 """By the name that an option gives it, which schemes a tool writes; `auto` tries them all."""

@@ -22,7 +22,7 @@ from capture4d.motions.anatomy import NAMINGS, Anatomy, find_anatomy, named_part
 from capture4d.motions.bvh import Bvh
 from capture4d.units import METRES
 
-__all__ = ["AXES", "Axis", "Clip", "MotionWords", "axis_name", "axis_turn", "understood", "world_frame"]
+__all__ = ["AXES", "UPRIGHT_DEG", "Axis", "Clip", "MotionWords", "axis_name", "axis_turn", "understood", "world_frame"]
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 AXES: dict[Axis, np.ndarray] = {
@@ -31,6 +31,8 @@ AXES: dict[Axis, np.ndarray] = {
 }  # fmt: skip
 _SNAP_DEG = 30.0
 """A trunk leans by less than this at rest; one that is further from all axes was turned."""
+UPRIGHT_DEG = 50.0
+"""No two bones of a trunk that stands or lies straight are turned more against each other."""
 _LEVEL_DEG = 4.0
 """The same of the line through both hips."""
 _STANDS = 0.8
@@ -180,7 +182,7 @@ def _rest_frame(rest: np.ndarray, anatomy: Anatomy) -> tuple[np.ndarray, bool]:
     """Left, up and forward of the skeleton at rest as columns, (3, 3); whether they are axes."""
     limbs = anatomy.limbs
     hips = (rest[limbs["left_hip"]] + rest[limbs["right_hip"]]) / 2
-    up = _unit(rest[anatomy.neck[0] if anatomy.neck else anatomy.head] - hips, "hips and head")
+    up = _unit(_trunk(rest, anatomy, hips), "hips and head")
     left = _unit(rest[limbs["left_hip"]] - rest[limbs["right_hip"]], "left and right hip")
     frame = _square(left, up)
     turns = Rotation.create_group("O").as_matrix()
@@ -192,6 +194,16 @@ def _rest_frame(rest: np.ndarray, anatomy: Anatomy) -> tuple[np.ndarray, bool]:
     feet = (rest[limbs["left_ankle"]] + rest[limbs["right_ankle"]]) / 2
     tall = rest[anatomy.head] - feet
     return (_square(left, tall) if tall @ up > 0.9 * np.linalg.norm(tall) else frame), False
+
+
+def _trunk(rest: np.ndarray, anatomy: Anatomy, hips: np.ndarray) -> np.ndarray:
+    """From hips to neck; where the bones between them have axes of their own, and lie anywhere, the first of them."""
+    bones = np.diff(rest[[anatomy.pelvis, *anatomy.spine, *anatomy.neck, anatomy.head]], axis=0)
+    lengths = np.linalg.norm(bones, axis=1)
+    least = np.cos(np.radians(UPRIGHT_DEG)) * lengths * lengths[0]
+    if lengths[0] > 1e-9 and (bones @ bones[0] < least - 1e-12).any():
+        return bones[0]
+    return rest[anatomy.neck[0] if anatomy.neck else anatomy.head] - hips
 
 
 def _square(left: np.ndarray, up: np.ndarray) -> np.ndarray:
@@ -213,10 +225,11 @@ def _world_up(places: np.ndarray, anatomy: Anatomy, rest_up: np.ndarray | None) 
     stands = posed @ mean >= _STANDS
     if rest_up is None:
         return posed, "" if stands else f"{axis_name(posed)} up is doubtful; --up says which it is"
-    if stands and ((posed == rest_up).all() or (posed == AXES["y"]).all() or _on_a_floor(feet, hips, posed)):
+    if (posed == rest_up).all() or (stands and _on_a_floor(feet, hips, posed)):
         return posed, ""
-    if (posed == rest_up).all():
-        return posed, ""
+    if stands and (posed == AXES["y"]).all():
+        return posed, (f"Y up, as heads stand, though at rest they stand along {axis_name(rest_up)}; "
+                       "--up says which it is")  # fmt: skip
     return rest_up, (f"{axis_name(rest_up)} up, from the rest pose, though heads are towards {axis_name(posed)}; "
                      "--up says which it is")  # fmt: skip
 

@@ -8,20 +8,25 @@ to one side.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from capture4d.errors import InputError
-from capture4d.motions.clips import Clip
+from capture4d.motions.clips import UPRIGHT_DEG, Clip
 
-__all__ = ["aligned", "rest_turns"]
+__all__ = ["aligned", "rest_turns", "trunk_turns"]
 
 _FOOT = np.array([0.0, -0.05, 0.12])
 """From ankle to toes of someone who stands."""
 _BENT = 0.05
 """Mean sine of a joint that is bent enough to show its axis."""
+_TURNED_DEG = 70.0
+"""Nobody goes about with a head that is turned, or a spine that is twisted from one joint to the next, by as much."""
+_SNAP_DEG = 30.0
+"""Joints whose axes are as near to those of a standing person, turned by right angles, were made so."""
 _FLEXES = {"hip": np.array([0.0, 0.0, -1.0]), "shoulder": np.array([0.0, 0.0, 1.0])}
 """Where shin and forearm go when knee and elbow bend, in a T-pose."""
 
@@ -56,6 +61,51 @@ def _t_pose(part: str) -> np.ndarray:
     """Where a limb points in a T-pose."""
     side, _, limb = part.partition("_")
     return np.array([0.0, -1.0, 0.0] if limb in ("hip", "knee") else [1.0 if side == "left" else -1.0, 0.0, 0.0])
+
+
+def trunk_turns(clip: Clip) -> dict[int, np.ndarray]:
+    """Joint of the trunk -> rotation (3, 3) of our rest pose onto the source's; nothing where its trunk stands at rest.
+
+    Where the pelvis has the axes of the world and the spine lies along its bones, or the like, no rest pose shows how
+    they belong together: the hips tell how the pelvis is turned, and each other joint is on average turned as the one
+    below it.
+    """
+    anatomy = clip.anatomy
+    chain = [anatomy.pelvis, *anatomy.spine, *anatomy.neck, anatomy.head]
+    steps = dict(zip(chain, np.diff(clip.rest[chain], axis=0), strict=False))
+    bones = {joint: bone / np.linalg.norm(bone) for joint, bone in steps.items() if np.linalg.norm(bone) > 1e-9}
+    if not any(bone[1] < np.cos(np.radians(UPRIGHT_DEG)) for bone in bones.values()) and not _turned(clip, chain):
+        return {}
+    left = clip.bone("right_hip", "left_hip")
+    up = bones.get(chain[0], np.array([0.0, 1.0, 0.0]))
+    if not np.linalg.norm(np.cross(left, up)) > 1e-3 * np.linalg.norm(left):
+        return {}
+    turns = {chain[0]: _snapped(_frame(left, up))}
+    for below, joint in pairwise(chain):
+        carrier = clip.world[:, below] @ turns[below]
+        mean = Rotation.from_matrix(np.swapaxes(clip.world[:, joint], 1, 2) @ carrier).mean().as_matrix()
+        turn = aligned(mean[:, 1], bones[joint]) @ mean if joint in bones else mean
+        turns[joint] = _snapped(turn)
+    return turns
+
+
+def _turned(clip: Clip, chain: Sequence[int]) -> bool:
+    """Whether joints of a trunk whose bones stand are turned about them as no person's are."""
+    for above, below in pairwise(chain):
+        local = Rotation.from_matrix(np.swapaxes(clip.world[:, above], 1, 2) @ clip.world[:, below]).mean()
+        x, y, z, w = local.as_quat()
+        sine = np.linalg.norm([x, y, z]) if below == chain[-1] else abs(y)
+        if 2 * np.degrees(np.arctan2(sine, abs(w))) > _TURNED_DEG:
+            return True
+    return False
+
+
+def _snapped(turn: np.ndarray) -> np.ndarray:
+    """A rotation by right angles, where it is near one."""
+    group = Rotation.create_group("O").as_matrix()
+    nearest = group[np.argmax(np.einsum("nab,ab->n", group, turn))].round()
+    near = np.degrees(Rotation.from_matrix(nearest.T @ turn).magnitude()) < _SNAP_DEG
+    return nearest if near else turn
 
 
 _NEXT = {"hip": "knee", "knee": "ankle", "shoulder": "elbow", "elbow": "wrist"}

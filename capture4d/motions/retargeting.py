@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from capture4d.body.skinning import ShapedBody, with_pose
 from capture4d.errors import InputError
 from capture4d.motions.clips import Clip
-from capture4d.motions.rest_alignment import aligned, rest_turns
+from capture4d.motions.rest_alignment import aligned, rest_turns, trunk_turns
 from capture4d.types import PoseSequence
 
 __all__ = ["SMPL_ORIGIN", "SMPL_TREE", "as_smpl", "frame_times", "is_smpl", "pose_sequence", "relative", "retarget"]
@@ -175,7 +175,9 @@ def frame_times(duration: float, fps: float, count: int, *, first_frame: int = 0
 
 def _driven(shaped: ShapedBody, skeleton: _Skeleton, clip: Clip) -> dict[str, np.ndarray]:
     """World rotations (T, 3, 3) of the joints that the clip moves, by name."""
-    anatomy, world = clip.anatomy, clip.world
+    anatomy, world = clip.anatomy, clip.world.copy()
+    for joint, turn in trunk_turns(clip).items():
+        world[:, joint] = world[:, joint] @ turn
     spine = _shared(world, anatomy.pelvis, anatomy.spine, len(skeleton.spine))
     # Without a joint of its own, the neck takes its part of how the head is turned from the chest.
     through = anatomy.neck or (anatomy.head,)

@@ -21,7 +21,7 @@ __all__ = ["RATES", "SmplParameters", "are_smpl_parameters", "read_smpl_paramete
 
 JOINTS = 22
 """SMPL's joints that its whole family shares."""
-WHOLE = ("poses", "pose_world", "pose", "fullpose", "full_pose", "smpl_poses")
+WHOLE = ("poses", "pose_world", "pose", "fullpose", "full_pose", "smpl_poses", "smpl_thetas", "pred_rotmat")
 ROOT = ("root_orient", "global_orient", "poses_root", "root_pose", "pose_root", "orient", "global_rot")
 BODY = ("pose_body", "body_pose", "poses_body", "body_poses")
 PLACE = (
@@ -34,8 +34,10 @@ PLACE = (
     "transl_world",
     "global_trans",
     "smpl_trans",
+    "pred_trans",
+    "cam_trans",
 )
-SHAPE = ("betas", "shape", "shapes", "beta", "smpl_betas")
+SHAPE = ("betas", "shape", "shapes", "beta", "smpl_betas", "pred_shape")
 SCALE = "smpl_scaling"
 """Of AIST++, whose translations are that many times too long."""
 RATES = ("mocap_framerate", "mocap_frame_rate", "fps", "framerate", "frame_rate", "mocap_fps", "framerate_hz")
@@ -43,8 +45,8 @@ ABOUT_ORIGIN, ABOUT_ORIGIN_PLACE = "rh", "th"
 """EasyMocap's: it turns the posed body about the origin of the world, not about its pelvis."""
 _RATE_RANGE = (0.1, 10_000.0)
 _MATRIX_TOLERANCE = 0.02
-_TURNS_MOST = 50.0
-"""Radians: longer rotation vectors are degrees."""
+_TURNS_MOST, _JOINT_MOST = 50.0, 4 * math.pi
+"""Radians: longer rotation vectors are degrees. The first joint may be a root that has been counted round and round."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -197,7 +199,7 @@ def _flat_forms(rows: np.ndarray) -> Iterator[np.ndarray]:
 def _from_vectors(vectors: np.ndarray, name: str) -> np.ndarray:
     _require_finite(vectors, name)
     length = np.linalg.norm(vectors, axis=-1)
-    if length.max() > _TURNS_MOST:
+    if length.max() > _TURNS_MOST or length[:, 1:].max(initial=0) > _JOINT_MOST:
         frame, joint = np.unravel_index(np.argmax(length), length.shape)
         raise InputError(f"'{name}': expected rotation vectors in radians, found one of length {length.max():.4g} "
                          f"in frame {frame} of {len(vectors)}, joint {joint}")  # fmt: skip

@@ -23,12 +23,12 @@ _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
 
 @contextlib.contextmanager
-def alone(output: Path, *, folder: bool, wait: bool = False) -> Iterator[None]:
+def alone(output: Path, *, folder: bool, wait: bool | None = False) -> Iterator[None]:
     """Nobody else writes to a folder, or to a file, meanwhile.
 
     Args:
         folder: whether it is a folder; it is made, and goes again if nothing is written to it.
-        wait: for whoever is writing to it, instead of refusing.
+        wait: for whoever is writing to it, instead of refusing; None where nobody can say that it should.
     Raises:
         InputError: somebody is, and `wait` is off.
         OSError: nothing can be written there; names it.
@@ -54,13 +54,13 @@ def alone(output: Path, *, folder: bool, wait: bool = False) -> Iterator[None]:
                 each.rmdir()
 
 
-def _waited_for(lock: Path, output: Path, wait: bool) -> int:
+def _waited_for(lock: Path, output: Path, wait: bool | None) -> int:
     told = False
     while (handle := _taken(lock)) is None:
         if not wait:
+            option = "" if wait is None else ", or with --wait"
             raise InputError(
-                "another capture4d command is writing there; run this one when it has ended, or with --wait",
-                where=output,
+                f"another capture4d command is writing there; run this one when it has ended{option}", where=output
             )
         if not told:
             print(f"capture4d: waiting for the command that is writing to {output}", file=sys.stderr, flush=True)

@@ -80,6 +80,14 @@ def test_a_rig_comes_back(tmp_path: Path, fisheye: bool, per_frame: bool, applie
         np.testing.assert_allclose(getattr(found, name), getattr(rig, name), atol=1e-9)
 
 
+def test_a_last_row_that_was_inverted_is_taken(tmp_path: Path):
+    content = transforms(calibration_rig(2, rng=np.random.default_rng(3)))
+    plain = read_transforms(written(tmp_path / "plain.json", content))
+    content["frames"][0]["transform_matrix"][3] = [1e-9, 0, -1e-8, 1.0000001]
+    found = read_transforms(written(tmp_path / "off.json", content))
+    np.testing.assert_array_equal(found.T_camera_world, plain.T_camera_world)
+
+
 def test_what_is_up_in_opengl_is_up_in_the_image(tmp_path: Path):
     """A camera at the origin that looks down -z, as OpenGL's do, and OpenCV's projection of what it sees."""
     frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}

@@ -2,13 +2,16 @@
 
 import json
 import os
-from importlib.metadata import PackageNotFoundError
+import subprocess
+import sys
+from importlib.metadata import PackageNotFoundError, files, requires
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 from capture4d.cli import installation
-from capture4d.cli.installation import Part, diagnose, load_apart
+from capture4d.cli.installation import Part, diagnose, load_apart, module_of
 from tests.command_line import run as command
 
 
@@ -54,6 +57,31 @@ def test_a_sound_installation_is_exit_0_and_names_its_parts(needs, capsys: pytes
     assert "nothing-here" not in said.out  # for another system
     assert "\n  pytest" not in said.out  # for development
     assert said.err == ""
+
+
+NEEDED = [need for need in map(Requirement, requires("capture4d") or []) if "extra" not in str(need.marker)]
+
+
+@pytest.mark.parametrize("need", NEEDED, ids=lambda need: need.name)
+def test_every_part_is_imported_by_the_name_that_its_files_have(need: Requirement):
+    if need.marker is None or need.marker.evaluate():
+        modules = {path.parts[0].split(".")[0] for path in files(need.name) or []}
+        assert module_of(need.name) in modules
+
+
+@pytest.mark.slow
+def test_anny_is_loaded_by_a_user_without_a_home(tmp_path: Path):
+    script = """
+import os, pwd
+os.environ.pop("HOME", None)
+def nobody(number): raise KeyError(number)
+pwd.getpwuid = nobody
+from capture4d.heavy_imports import import_anny
+print(import_anny().__name__, os.environ.get("HOME"))
+"""
+    environment = {**os.environ, "CAPTURE4D_CACHE": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout == "anny None\n"
 
 
 def test_a_missing_part_is_exit_3_and_one_line(needs, capsys: pytest.CaptureFixture[str]):

@@ -377,7 +377,6 @@ def test_a_spine_of_any_number_is_shared_out(spine: int, neck: int, light_body: 
 
 def along_one_axis(source: Source, roll: dict[str, float]) -> Source:
     """The same motion, of a skeleton whose limbs point up at rest, each rolled about itself: as LAFAN1 has them."""
-    rotations, _ = source.world()
     count = len(source.names)
     rest = np.tile(np.eye(3), (count, 1, 1))  # the joint's frame in the one it had
     for joint, part in enumerate(BASE.names):
@@ -390,13 +389,7 @@ def along_one_axis(source: Source, roll: dict[str, float]) -> Source:
         first = bone / np.linalg.norm(bone)
         frame = np.stack([np.cross(first, across), first, across], axis=1)
         rest[joint] = frame @ Rotation.from_euler("y", roll.get(limb, 0.0), degrees=True).as_matrix()
-    world = rotations @ rest
-    local, offsets = world.copy(), source.offsets.copy()
-    for joint, parent in enumerate(source.parents):
-        if parent >= 0:
-            local[:, joint] = np.swapaxes(world[:, parent], 1, 2) @ world[:, joint]
-            offsets[joint] = rest[parent].T @ source.offsets[joint]
-    return replace(source, local=local, offsets=offsets)
+    return with_axes(source, rest)
 
 
 @pytest.mark.parametrize("roll", [{}, {"hip": 90.0, "knee": 90.0}, {"hip": 180.0, "knee": 180.0, "elbow": 40.0},
@@ -418,6 +411,69 @@ def test_limbs_that_point_up_at_rest(roll: dict[str, float], light_body: Body, p
         joint = light_body.joint_names.index(name)
         turn = np.swapaxes(world_of(light_body, moved)[:, joint], 1, 2) @ world_of(light_body, plain)[:, joint]
         assert np.degrees(Rotation.from_matrix(turn).magnitude()).max() < 5, name
+
+
+RIGHT = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+TWIST = Rotation.from_euler("y", 90, degrees=True).as_matrix()
+TRUNK = ("spine1", "spine2", "spine3", "neck1", "neck2", "head")
+
+
+@pytest.mark.parametrize(
+    "rest",
+    [
+        dict.fromkeys(TRUNK, RIGHT),  # along X from the spine up, under a pelvis of the world's axes
+        dict.fromkeys(TRUNK[:3], RIGHT),
+        dict.fromkeys(TRUNK[1:], RIGHT @ TWIST),
+        {"spine3": TWIST},
+        {"head": RIGHT},
+        {"head": TWIST @ RIGHT},
+    ],
+)
+def test_joints_of_the_trunk_with_axes_of_their_own(rest: dict[str, np.ndarray], light_body: Body, tmp_path) -> None:
+    turned = with_axes(CMU, np.stack([rest.get(part, np.eye(3)) for part in BASE.names]))
+    np.testing.assert_allclose(turned.world()[1], CMU.world()[1], atol=1e-9)
+    worlds = []
+    for name, source in (("turned", turned), ("plain", CMU)):
+        (tmp_path / f"{name}.bvh").write_text(text(source))
+        worlds.append(world_of(light_body, read_motion(tmp_path / f"{name}.bvh", light_body)))
+    for joint, name in enumerate(light_body.joint_names):
+        if name.startswith(("root", "spine", "upper", "lower", "neck", "head")):
+            turn = np.swapaxes(worlds[0][:, joint], 1, 2) @ worlds[1][:, joint]
+            limit = 5 if name.startswith(("upper", "lower")) else 0.1  # legs that point aside at rest: by their knees
+            assert np.degrees(Rotation.from_matrix(turn).magnitude()).max() < limit, name
+
+
+def test_a_head_of_any_axes_looks_where_the_neck_does(light_body: Body, tmp_path: Path) -> None:
+    """On average, when nothing else tells."""
+    rest = np.tile(np.eye(3), (len(BASE.names), 1, 1))
+    rest[BASE.names.index("head")] = Rotation.from_rotvec([1.0, -1.2, 0.7]).as_matrix()
+    (tmp_path / "clip.bvh").write_text(text(with_axes(CMU, rest)))
+    world = world_of(light_body, read_motion(tmp_path / "clip.bvh", light_body))
+    neck, head = (light_body.joint_names.index(name) for name in ("neck02", "head"))
+    local = np.swapaxes(world[:, neck], 1, 2) @ world[:, head]
+    assert np.degrees(Rotation.from_matrix(local).mean().magnitude()) < 1
+
+
+def with_axes(source: Source, rest: np.ndarray) -> Source:
+    """The same motion, of a skeleton whose joints have the axes `rest` (J, 3, 3) in those that they had."""
+    world = source.world()[0] @ rest
+    local, offsets = world.copy(), source.offsets.copy()
+    for joint, parent in enumerate(source.parents):
+        if parent >= 0:
+            local[:, joint] = np.swapaxes(world[:, parent], 1, 2) @ world[:, joint]
+            offsets[joint] = rest[parent].T @ source.offsets[joint]
+    return replace(source, local=local, offsets=offsets)
+
+
+def test_y_up_of_a_skeleton_that_stands_otherwise_is_told(placed) -> None:
+    """Who lies along Y on a floor of which Z is up looks the same, so it is said which was taken."""
+    down = Rotation.from_euler("x", -90, degrees=True).as_matrix()
+    local = CMU.local.copy()
+    local[:, 0] = down
+    notes: list[str] = []
+    lying = replace(CMU, local=local, places=np.tile((0.0, 13.0, 0.0), (len(local), 1)))
+    placed(text(lying.in_axes(np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]))), say=notes.append)
+    assert "Y up, as heads stand, though at rest they stand along Z; --up says which it is" in notes
 
 
 def world_of(body: Body, poses) -> np.ndarray:

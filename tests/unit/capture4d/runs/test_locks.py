@@ -104,3 +104,35 @@ def test_two_commands_on_one_work_folder(tube_capture: Path, tmp_path: Path) -> 
         "run this one when it has ended, or with --wait\n"
     )
     assert not any((tmp_path / "work").glob("garment*"))
+
+
+def command(*arguments: object) -> list[str]:
+    return [sys.executable, "-m", "capture4d", *map(str, arguments)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fixes", [True, False])
+def test_a_command_says_wait_only_where_it_can(tmp_path: Path, fixes: bool) -> None:
+    output = tmp_path / ("take-fixed" if fixes else "out.bvh")
+    arguments = ("check", tmp_path / "take", "--fix") if fixes else ("convert-poses", tmp_path / "in.npz", output)
+    with held_elsewhere(output, folder=False):
+        done = subprocess.run(command(*arguments), capture_output=True, text=True, check=False)
+    said = "another capture4d command is writing there; run this one when it has ended"
+    assert (done.returncode, done.stderr) == (1, f"capture4d: {output}: {said}\n")
+
+
+@pytest.mark.slow
+def test_a_command_that_is_terminated_says_so_and_leaves_no_lock(tmp_path: Path) -> None:
+    """While it waits for another one: there nothing is done yet, and the signal cannot come too late."""
+    with held_elsewhere(tmp_path / "work", folder=True):
+        arguments = command("extract", tmp_path / "take", "--output", tmp_path / "work", "--wait")
+        with subprocess.Popen(arguments, stderr=subprocess.PIPE, text=True) as process:
+            assert process.stderr is not None
+            assert "waiting for the command" in process.stderr.readline()
+            process.terminate()
+            said = process.stderr.read()
+        assert process.returncode == 143
+        assert said.startswith("capture4d: terminated;")
+        assert said.count("\n") == 1
+    with alone(tmp_path / "work", folder=True):
+        pass
