@@ -23,10 +23,10 @@ from benchmarks.cached_takes import cached_take
 from benchmarks.metric import Metric
 from capture4d.body.skinning import pose_frame, with_shape
 from capture4d.captures.capture import read_capture
+from capture4d.captures.evaluation import curve_distances
 from capture4d.captures.take_colours import KnownColours
 from capture4d.captures.truth import read_truth_frame, read_truth_model
 from capture4d.colours.learning import ColoursNotSeparableError, learn_colours
-from capture4d.evaluation import curve_distances
 from capture4d.extraction.garment import ColourNotFoundError, cut_out
 from capture4d.files.records import load_poses
 from capture4d.geometry.ray_casting import surface_distances

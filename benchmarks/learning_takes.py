@@ -14,9 +14,9 @@ from benchmarks.renewal import renew
 from capture4d import pipeline
 from capture4d.body.skinning import ShapedBody, with_shape
 from capture4d.captures.capture import Capture, read_capture
+from capture4d.captures.evaluation import material_points
 from capture4d.captures.truth import read_truth_model, read_truth_vertices
 from capture4d.captures.work_folder import load_records, load_registration, open_work
-from capture4d.evaluation import material_points
 from capture4d.files.records import load_poses
 from capture4d.types import Garment, PoseSequence, RegisteredSequence
 from data_synth.config import TRAINING_SETS, TrainingSetConfig

@@ -30,9 +30,15 @@ from benchmarks.memory import peak_rss_mb
 from benchmarks.metric import Metric
 from benchmarks.peers import PEERS, run_peer
 from capture4d.captures.capture import Capture, read_capture, write_capture_description
+from capture4d.captures.evaluation import (
+    border_errors,
+    correspondence_errors,
+    drift_ratio,
+    material_points,
+    truth_distances,
+)
 from capture4d.captures.garment_scans import load_garment_scan
 from capture4d.captures.truth import read_truth_model, read_truth_vertices
-from capture4d.evaluation import border_errors, correspondence_errors, drift_ratio, material_points, truth_distances
 from capture4d.extraction.stage import ExtractionSettings
 from capture4d.extraction.stage import run as extract
 from capture4d.files.atomic import read_json

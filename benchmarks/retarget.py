@@ -17,7 +17,7 @@ from benchmarks.learning_takes import Lesson, lesson, training_set, true_take
 from benchmarks.metric import Metric
 from capture4d.body.skinning import ShapedBody
 from capture4d.captures.capture import read_capture
-from capture4d.evaluation import correspondence_errors
+from capture4d.captures.evaluation import correspondence_errors
 from capture4d.geometry.intersection_removal import Removed
 from capture4d.types import BlendshapeModel, PoseSequence, RegisteredSequence
 from data_synth.config import TrainingSetConfig

@@ -15,9 +15,9 @@ from PIL import Image
 from capture4d.app.drawing.render import Drawn, View, frame_view, heat_colours, render
 from capture4d.body.skinning import pose_frame, with_shape
 from capture4d.captures.capture import read_capture, read_scan
+from capture4d.captures.evaluation import truth_distances
 from capture4d.captures.truth import read_truth_model, read_truth_vertices
 from capture4d.captures.work_folder import open_work
-from capture4d.evaluation import truth_distances
 from capture4d.types import Mesh
 
 CLOTH, PAINT, SKIN = (128, 152, 190), (255, 196, 0), (214, 190, 172)

@@ -11,8 +11,8 @@ import torch
 
 from capture4d.app.compare.methods import Method
 from capture4d.captures.capture import Capture
+from capture4d.captures.evaluation import correspondence_errors, material_points
 from capture4d.captures.truth import TruthModel, read_truth_vertices
-from capture4d.evaluation import correspondence_errors, material_points
 from capture4d.geometry.uv_layout import millimetres_per_texel
 from wrinkles.normal_maps.metrics import score
 from wrinkles.normal_maps.pairs import PairTake

@@ -11,9 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from capture4d.captures.truth import TruthModel
-from capture4d.captures.work_folder import VERDICTS
-from capture4d.evaluation import (
+from capture4d.captures.evaluation import (
     border_errors,
     correspondence_errors,
     drift_per_frame,
@@ -21,6 +19,8 @@ from capture4d.evaluation import (
     material_points,
     truth_distances,
 )
+from capture4d.captures.truth import TruthModel
+from capture4d.captures.work_folder import VERDICTS
 from capture4d.types import RegisteredSequence
 
 __all__ = ["METRICS", "column", "shown", "summarise", "truth_measures"]

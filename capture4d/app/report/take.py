@@ -35,10 +35,10 @@ from capture4d.app.report.stages import (
     tracking,
 )
 from capture4d.captures.capture import Capture, read_capture
+from capture4d.captures.evaluation import correspondence_errors, material_points
 from capture4d.captures.truth import TruthModel, read_truth_model, read_truth_vertices
 from capture4d.captures.work_folder import VERDICTS, WorkFolder
 from capture4d.errors import InputError
-from capture4d.evaluation import correspondence_errors, material_points
 from capture4d.files.atomic import write_bytes, write_json
 from capture4d.runs.stage import StageResult, open_stage, read_record, require_complete, result_of
 from capture4d.runs.workers import run_jobs, shared

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from capture4d.captures.capture import read_capture, read_scan
+from capture4d.captures.evaluation import material_points
 from capture4d.captures.truth import read_truth_frame, read_truth_model
 from capture4d.errors import InputError
-from capture4d.evaluation import material_points
 from capture4d.files.atomic import read_json
 from capture4d.files.records import load_garment, load_rig
 from capture4d.geometry.mesh import boundary_loops, face_areas

@@ -214,13 +214,13 @@ def test_a_ply_that_lies_is_one_line(data: bytes, said: str, tmp_path: Path):
 
 def test_a_ply_may_hold_more_than_a_mesh(tmp_path: Path):
     path = tmp_path / "x.ply"
+    more = "element camera 1\nproperty float f\n"
+    binary = ply(before=more).replace(b"ascii", b"binary_little_endian").partition(b"0 0 0")[0]
     for data in (
         ply(),
-        ply(before="element junk 4000000000\n"),
-        ply(before="element junk 4000000000\n").replace(b"ascii", b"binary_little_endian").partition(b"0 0 0")[0]
-        + BINARY + struct.pack("<B3i", 3, 0, 1, 2),
-        ply(colours="property list uchar uchar red\n", body="0 0 0 1 5\n1 0 0 2 5 5\n0 1 0 0\n3 0 1 2\n"),
-    ):  # fmt: skip
+        ply(before=more, body="7\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"),
+        binary + struct.pack("<f", 7) + BINARY + struct.pack("<B3i", 3, 0, 1, 2),
+    ):
         path.write_bytes(data)
         found = read_mesh(path)
         assert (found.mesh.faces.tolist(), found.colours) == ([[0, 1, 2]], None)

@@ -243,5 +243,5 @@ def test_a_buffer_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 def test_bytes_that_nothing_uses_may_not_be_elsewhere_either(uri: str, tmp_path: Path) -> None:
     file = sheet()
     file.add("buffers", {"uri": uri, "byteLength": 100})
-    with pytest.raises(InputError, match="buffer"):
+    with pytest.raises(InputError, match=r"buffer|expected the name of a file"):
         read_mesh(file.save(tmp_path / "sheet.glb"))

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from capture4d.evaluation import (
+from capture4d.captures.evaluation import (
     border_errors,
     correspondence_errors,
     curve_distances,
