@@ -11,6 +11,7 @@ from capture4d.errors import InputError, NotFiniteError
 __all__ = [
     "LARGEST_RATE",
     "SMALLEST_RATE",
+    "outside",
     "require_array",
     "require_finite",
     "require_frame_rate",
@@ -55,8 +56,15 @@ def require_finite(owner: str, name: str, value: np.ndarray) -> None:
         raise NotFiniteError(f"{owner}.{name}: expected finite numbers, found NaN or inf in {bad} of {len(value)} rows")
 
 
+def outside(indices: np.ndarray, count: int) -> bool:
+    """Whether whole numbers, at least one, are not all from 0 to below a count; signed ones in one pass."""
+    if indices.dtype == np.int32 and count < 2**31:
+        return int(indices.view(np.uint32).max()) >= count
+    return bool(indices.min() < 0 or indices.max() >= count)
+
+
 def require_indices(owner: str, name: str, value: np.ndarray, count: int) -> None:
-    if value.size and (value.min() < 0 or value.max() >= count):
+    if value.size and outside(value, count):
         found = int(value.min()) if value.min() < 0 else int(value.max())
         raise InputError(f"{owner}.{name}: expected indices from 0 to {count - 1}, found {found}")
 

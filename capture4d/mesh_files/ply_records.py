@@ -85,8 +85,12 @@ def _equal_records(element: Element, body: memoryview, offset: int, order: str) 
                 return None
             fields.append((f"length {index}", order + length))
             size += step
-        fields.append((f"{index}", order + kind, (entries,)) if length else (f"{index}", order + kind))
-        size += np.dtype(kind).itemsize * (entries if length else 1)
+        width = np.dtype(kind).itemsize * (entries if length else 1)
+        # A list is copied as bytes: numbers that lie askew are slow to copy one by one.
+        fields.append(
+            (f"{index}", f"V{width}") if width and length else (f"{index}", order + kind, (entries,) * bool(length))
+        )
+        size += width
     record = np.dtype(fields)
     end = offset + record.itemsize * element.count
     if end > len(body) or not element.count:
@@ -97,8 +101,12 @@ def _equal_records(element: Element, body: memoryview, offset: int, order: str) 
         return None
     for index, (name, kind, length) in enumerate(element.properties):
         column = records[f"{index}"]
-        sizes = np.full(element.count, column.shape[1]) if length else None
-        element.keep(name, column.astype(kind).reshape(-1) if length else column, sizes)
+        if not length:
+            element.keep(name, column, None)
+            continue
+        flat = np.ascontiguousarray(column).view(order + kind) if column.dtype.kind == "V" else column.reshape(-1)
+        sizes = np.broadcast_to(np.int64(len(flat) // element.count), element.count)
+        element.keep(name, flat.astype(kind, copy=False), sizes)
     return end
 
 

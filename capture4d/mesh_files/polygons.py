@@ -9,6 +9,7 @@ from jaxtyping import Float, Float64, Int32, Integer, UInt8
 
 from capture4d.errors import InputError
 from capture4d.types import Mesh
+from capture4d.value_checks import outside
 
 __all__ = [
     "MeshFile",
@@ -83,7 +84,7 @@ def polygon_mesh(
     """
     if sizes.size and sizes.min() < 3:
         raise InputError(f"face {int(sizes.argmin())}: expected at least 3 corners, found {sizes.min()}")
-    if corners.size and (corners.min() < 0 or corners.max() >= len(vertices)):
+    if corners.size and outside(corners, len(vertices)):
         raise InputError(
             f"expected vertex indices from 0 to {len(vertices) - 1}, found {corners.min()}..{corners.max()}"
         )
