@@ -15,7 +15,7 @@ import safetensors.numpy
 from capture4d.errors import InputError
 from capture4d.files.atomic import write_bytes
 from capture4d.files.json_values import json_value
-from capture4d.files.reading import reading
+from capture4d.files.reading import reading, shortened
 
 __all__ = ["TensorFile", "read_tensors", "write_tensors"]
 
@@ -34,7 +34,8 @@ class TensorFile:
 
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self.tensors:
-            raise InputError(f"expected a tensor '{name}', found {', '.join(self.tensors) or 'none'}", where=self.path)
+            found = shortened(", ".join(self.tensors), 200) or "none"
+            raise InputError(f"expected a tensor '{shortened(name, 80)}', found {found}", where=self.path)
         return self.tensors[name]
 
     def get(self, name: str) -> np.ndarray | None:
@@ -47,7 +48,8 @@ class TensorFile:
     def entry(self, name: str) -> Any:
         """An entry of the note."""
         if name not in self.note:
-            raise InputError(f"expected '{name}' in its note, found {', '.join(self.note) or 'none'}", where=self.path)
+            found = shortened(", ".join(self.note), 200) or "none"
+            raise InputError(f"expected '{name}' in its note, found {found}", where=self.path)
         return self.note[name]
 
 
@@ -86,5 +88,5 @@ def read_tensors(path: str | Path, kind: str) -> TensorFile:
             raise error
         if not isinstance(note, dict) or note.get("kind") != kind:
             found = note.get("kind") if isinstance(note, dict) else None
-            raise InputError(f"expected {kind}, found {found or 'a file of somebody else'}")
+            raise InputError(f"expected {kind}, found {shortened(str(found or 'a file of somebody else'), 80)}")
     return TensorFile(path, tensors, note)

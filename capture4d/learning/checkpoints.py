@@ -8,6 +8,7 @@ holds the optimisers' learning rates and a note of the training's own.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -107,7 +108,8 @@ def filled(make: Callable[[], Network], weights: Mapping[str, Tensor], *, source
         InputError: they are the weights of another architecture, or no weights.
     """
     with reading(source, "network"):
-        with torch.device("meta"):
+        with torch.device("meta"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of layers without a number: their weights are judged below
             network = make()
         _require_weights(network, weights, source)
         for key, value in weights.items():

@@ -80,6 +80,8 @@ def load_offset_model(path: Path) -> OffsetModel:
     with reading(path, "network"):
         kind, history = file.entry("network"), file.entry("history")
         joints = np.array(wholes(file.entry("joints"), "joints"), np.int64)
+        if not len(joints):
+            raise InputError("joints: expected at least one, found none")
         texels = whole(file.entry("texels"), "texels", least=8)
         if kind not in NETWORKS:
             raise InputError(f"expected a network called {' or '.join(NETWORKS)}, found {shortened(str(kind), 80)}")
