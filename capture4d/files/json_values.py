@@ -6,13 +6,10 @@ import json
 import math
 from typing import Any
 
-import numpy as np
-from jaxtyping import Float64
-
 from capture4d.errors import InputError
 from capture4d.files.reading import one_line, shortened
 
-__all__ = ["entry", "json_value", "number", "numbers", "text", "texts", "whole", "wholes"]
+__all__ = ["entry", "json_value", "number", "text", "texts", "whole", "wholes"]
 
 
 def json_value(data: str | bytes) -> Any:
@@ -86,16 +83,6 @@ def whole(value: Any, name: str, *, least: int = 0, most: int = 2**31 - 1) -> in
 
 def wholes(value: Any, name: str, *, least: int = 0) -> tuple[int, ...]:
     return tuple(whole(each, name, least=least) for each in _listed(value, name))
-
-
-def numbers(value: Any, shape: tuple[int, ...], name: str) -> Float64[np.ndarray, "..."]:
-    """Nested lists of numbers as an array of this shape."""
-    if not shape:
-        return np.array(number(value, name))
-    rows = _listed(value, name)
-    if len(rows) != shape[0]:
-        raise InputError(f"{name}: expected {shape[0]} entries, found {len(rows)}")
-    return np.array([numbers(row, shape[1:], name) for row in rows]).reshape(shape)
 
 
 def text(value: Any, name: str) -> str:

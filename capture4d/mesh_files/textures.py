@@ -11,29 +11,14 @@ from typing import Literal, assert_never
 import numpy as np
 from jaxtyping import Float, Float64, Integer, UInt8
 
-from capture4d.errors import InputError
 from capture4d.types import Mesh
 
-__all__ = ["Wrap", "mean_at_vertices", "of_faces_at_vertices", "sampled", "texture_colours"]
+__all__ = ["Wrap", "mean_at_vertices", "of_faces_at_vertices", "sampled"]
 
 _EDGE = 1e-4
 """How far beyond its edge a texture does not begin again: rounding put the coordinate there."""
 Wrap = Literal["repeat", "mirror", "clamp"]
 """How a texture goes on beyond its edges."""
-
-
-def texture_colours(mesh: Mesh, image: UInt8[np.ndarray, "rows columns 3"]) -> UInt8[np.ndarray, "verts 3"]:
-    """Sample a texture at the vertices of a mesh with UVs; vertices that no face uses are black.
-
-    Args:
-        image: sRGB; v = 1 is its first row, as in obj files. UVs beyond 0 to 1 repeat it.
-    Raises:
-        InputError: the mesh has no UVs.
-    """
-    if mesh.uv is None:
-        raise InputError("a texture needs UVs, found none")
-    corners = sampled(image, mesh.uv.reshape(-1, 2))
-    return mean_at_vertices(mesh.faces.reshape(-1), corners, len(mesh.vertices))
 
 
 def sampled(

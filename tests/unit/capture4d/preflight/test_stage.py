@@ -22,7 +22,7 @@ from capture4d.errors import InputError
 from capture4d.files.atomic import write_json
 from capture4d.files.records import load_poses, save_body, save_poses
 from capture4d.mesh_files.meshes import read_coloured_mesh, read_mesh, write_mesh
-from capture4d.mesh_files.textures import texture_colours
+from capture4d.mesh_files.textures import mean_at_vertices, sampled
 from capture4d.motions.retargeting import pose_sequence
 from capture4d.preflight.facts import BadFrame, Paints, TakeFacts
 from capture4d.preflight.findings import ADVICE, CODES
@@ -226,7 +226,9 @@ def test_a_texture_of_a_ramp_gives_the_ramp_at_the_vertices(tmp_path: Path):
         np.stack([u, [0.9, 0.1, 0.9]], 1)[None].astype(np.float32),
     )
     expected = [[10, 200, 0], [200, 0, 0], [100, 200, 0]]
-    np.testing.assert_array_equal(texture_colours(mesh, ramp), expected)
+    corners = sampled(ramp, mesh.uv.reshape(-1, 2))
+    found = mean_at_vertices(mesh.faces.reshape(-1), corners, len(mesh.vertices))
+    np.testing.assert_array_equal(found, expected)
     write_mesh(tmp_path / "scan.obj", mesh)
     Image.fromarray(ramp).save(tmp_path / "skin.png")
     (tmp_path / "scan.mtl").write_text("newmtl skin\nmap_Kd skin.png\n")
