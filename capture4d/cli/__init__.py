@@ -1,1 +1,1 @@
-"""The command line: one class a command, and one line for whatever goes wrong."""
+"""The command line: arguments to one command, and one line for whatever goes wrong."""

@@ -20,15 +20,15 @@ from typing import Any, NoReturn
 
 import tyro
 
-from capture4d.cli.capture import Calibrate, Check, CheckRig
-from capture4d.cli.doctor import Doctor
+from capture4d.cli.commands.capture import Calibrate, Check, CheckRig
+from capture4d.cli.commands.doctor import Doctor
+from capture4d.cli.commands.files import ConvertBody, ConvertPoses, ConvertRig, RegisterMesh, Template
+from capture4d.cli.commands.models import Animate, Fit
+from capture4d.cli.commands.stages import Extract, Register, Report, Run, Track
+from capture4d.cli.commands.synthesis import Demo, Scan, Synth, SynthBoard
+from capture4d.cli.commands.wrinkles import Compare, WrinklesApply, WrinklesMaps, WrinklesOffsets, WrinklesTrain
 from capture4d.cli.exit_codes import BAD_COMMAND_LINE, BAD_INPUT, GOOD, INTERRUPTED, TERMINATED
 from capture4d.cli.faults import check_command
-from capture4d.cli.files import ConvertBody, ConvertPoses, ConvertRig, RegisterMesh, Template
-from capture4d.cli.models import Animate, Fit
-from capture4d.cli.stages import Extract, Register, Report, Run, Track
-from capture4d.cli.synthesis import Demo, Scan, Synth, SynthBoard
-from capture4d.cli.wrinkles import Compare, WrinklesApply, WrinklesMaps, WrinklesOffsets, WrinklesTrain
 from capture4d.errors import CommandLineError, InputError
 from capture4d.runs.address_space import memory_fault, require_address_space
 from capture4d.settings import gathered_faults
