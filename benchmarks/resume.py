@@ -47,7 +47,7 @@ def run(
     console = Console(stderr=True)
     moments = random.Random(seed)
     trials = min(kills, 3) if quick else kills
-    stages, options = (TRACKED, ("--track",)) if track else (STAGES, ())
+    stages, options = (TRACKED, ("--tracked",)) if track else (STAGES, ())
     with tempfile.TemporaryDirectory(prefix="capture4d-resume-") as scratch:
         folder = Path(scratch)
         if capture is None:

@@ -17,6 +17,7 @@ from capture4d.app.compare.config import CompareConfig
 from capture4d.calibration.config import CalibrationConfig, RigCheckConfig
 from capture4d.captures.capture import Capture, read_capture
 from capture4d.captures.work_folder import WorkFolder, open_work
+from capture4d.runs.run_log import logged_stage
 from capture4d.runs.stage import StageResult
 from capture4d.synthetic import scan, synth, synth_board
 from capture4d.templates.config import TemplateConfig
@@ -64,6 +65,7 @@ AnyCapture: TypeAlias = Capture | Place
 AnyWork: TypeAlias = WorkFolder | Place
 
 
+@logged_stage("extract")
 def extract(
     capture: AnyCapture, work: AnyWork, *, learn_colours: bool = False, workers: int = 1, overwrite: bool = False
 ) -> StageResult:
@@ -79,6 +81,7 @@ def extract(
     return stage(_capture(capture), _path(work) / "garment", config, workers=workers, overwrite=overwrite)
 
 
+@logged_stage("track")
 def track(
     capture: AnyCapture,
     work: AnyWork,
@@ -95,6 +98,7 @@ def track(
     )
 
 
+@logged_stage("register")
 def register(
     capture: AnyCapture,
     work: AnyWork,
@@ -123,6 +127,7 @@ def register(
     )
 
 
+@logged_stage("report")
 def report(
     work: AnyWork, *, capture: AnyCapture | None = None, workers: int = 1, overwrite: bool = False
 ) -> StageResult:
@@ -181,6 +186,7 @@ def _needs_tracking(capture: Capture) -> bool:
     return capture.template.skin_weights is not None and not (capture.path / "poses.npz").is_file()
 
 
+@logged_stage("calibrate")
 def calibrate(
     images: Place,
     output: Place,
@@ -204,15 +210,9 @@ def calibrate(
     from capture4d.calibration.stage import run as stage
 
     result = stage(
-        Path(images),
-        Path(output),
-        board,
-        config or CalibrationConfig(),
-        pattern=pattern,
-        colmap=_maybe(colmap),
-        workers=workers,
-        overwrite=overwrite,
-    )
+        Path(images), Path(output), board, config or CalibrationConfig(),
+        pattern=pattern, colmap=_maybe(colmap), workers=workers, overwrite=overwrite,
+    )  # fmt: skip
     write_page(Path(output).with_name("calibration.html"), result.report)
     return result
 
@@ -274,13 +274,7 @@ def template(
     """
     from capture4d.templates.stage import run as stage
 
-    return stage(
-        None if mesh is None else Path(mesh),
-        Path(output),
-        config or TemplateConfig(),
-        body=None if body is None else Path(body),
-        poses=None if poses is None else Path(poses),
-    )
+    return stage(_maybe(mesh), Path(output), config or TemplateConfig(), body=_maybe(body), poses=_maybe(poses))
 
 
 def register_mesh(
@@ -297,6 +291,7 @@ def register_mesh(
     return stage(Path(template), Path(scan), Path(output), config, find_border=painted_border)
 
 
+@logged_stage("fit")
 def fit(
     works: Sequence[AnyWork],
     output: Place,
@@ -318,6 +313,7 @@ def fit(
     return stage(opened, Path(output), config or FitConfig(), device=device, workers=workers, overwrite=overwrite)
 
 
+@logged_stage("animate")
 def animate(
     model: Place,
     poses: Place,
@@ -347,6 +343,7 @@ def animate(
     )  # fmt: skip
 
 
+@logged_stage("wrinkles maps")
 def wrinkles_maps(
     work: AnyWork,
     config: PairConfig | None = None,
@@ -366,6 +363,7 @@ def wrinkles_maps(
     return stage(_work(work), config or PairConfig(), high_from=lender, workers=workers, overwrite=overwrite)
 
 
+@logged_stage("wrinkles train")
 def wrinkles_train(
     works: Sequence[AnyWork],
     output: Place,
@@ -390,6 +388,7 @@ def wrinkles_train(
     )  # fmt: skip
 
 
+@logged_stage("wrinkles apply")
 def wrinkles_apply(
     model: Place, work: AnyWork, config: ApplyConfig | None = None, *, workers: int = 1, overwrite: bool = False
 ) -> StageResult:
@@ -399,6 +398,7 @@ def wrinkles_apply(
     return stage(Path(model), _work(work), config or ApplyConfig(), workers=workers, overwrite=overwrite)
 
 
+@logged_stage("wrinkles offsets")
 def wrinkles_offsets(
     work: AnyWork, config: OffsetConfig | None = None, *, workers: int = 1, overwrite: bool = False
 ) -> StageResult:
@@ -410,6 +410,7 @@ def wrinkles_offsets(
     return stage(opened, opened.path / OFFSETS, config or OffsetConfig(), workers=workers, overwrite=overwrite)
 
 
+@logged_stage("compare")
 def compare(
     work: AnyWork,
     model: Place,

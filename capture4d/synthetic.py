@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from capture4d.errors import InputError
+from capture4d.runs.run_log import logged_stage
 from capture4d.runs.stage import StageResult
 from data_synth.config import PRESETS, TRAINING_SETS, BoardConfig, SynthConfig, TrainingSetConfig
 from data_synth.scanner.config import ScanConfig
@@ -15,6 +16,7 @@ __all__ = ["scan", "synth", "synth_board"]
 Place: TypeAlias = str | Path
 
 
+@logged_stage("synth")
 def synth(
     output: Place, config: SynthConfig | TrainingSetConfig | str = "demo", *, workers: int = 1, overwrite: bool = False
 ) -> StageResult:
@@ -39,6 +41,7 @@ def synth(
     return training_set(Path(output), config, workers=workers, overwrite=overwrite)
 
 
+@logged_stage("scan")
 def scan(
     meshes: Place,
     output: Place,
@@ -60,6 +63,7 @@ def scan(
     return stage(Path(meshes), Path(output), config, template=given, workers=workers, overwrite=overwrite)
 
 
+@logged_stage("synth-board")
 def synth_board(
     rig: Place, images: Place, config: BoardConfig | None = None, *, workers: int = 1, overwrite: bool = False
 ) -> StageResult:

@@ -85,6 +85,7 @@ class SimulationConfig:
     vertices: Vertices = 5000
     """Vertices of the simulated sheet."""
     fps: Positive = 60.0
+    """Frames that are simulated a second."""
     substeps: Count = 48
     """Steps a frame. Many short ones converge far better than many iterations: the hem of 48 x 1 hangs as high as that
     of 32 x 2, at three quarters of the cost, and that of 24 x 2 higher than that of 16 x 3."""
@@ -97,11 +98,13 @@ class SimulationConfig:
     rest_frames: Whole = 12
     """Frames at rest before the clip starts."""
     contact_gap_m: NonNegative = 0.008
+    """Distance from the body at which the contact of the cloth is looked for, metres."""
     contact_substeps: Count = 3
     """Substeps from one search for contacts to the next."""
     damping: Share = 0.99
     """Share of the velocity kept each substep."""
     calm_damping: Share = 0.85
+    """The same in the calm frames."""
     hold_hz: NonNegative = 20.0
     """Frequency at which a vertex at the shoulders would swing about its place on the body: how firmly the shirt keeps
     its seat. 0 leaves the sheet free, and its folds at the shoulders to its history."""
@@ -150,6 +153,7 @@ class SynthConfig:
     """One synthetic take: who, what, how it moves, how it is scanned."""
 
     name: str = "tshirt"
+    """Of the capture."""
     seed: Seed = 0
     """Everything random follows from it; equal seeds give equal files."""
     frames: Count = 120
@@ -168,6 +172,7 @@ class SynthConfig:
     template_vertices: Vertices = 5000
     """Vertices of the registration template."""
     fabric: Literal["jersey", "shirt-cotton", "linen"] = "jersey"
+    """What the shirt is made of."""
     style: GarmentStyle = field(default_factory=GarmentStyle)
     outfit: OutfitName = "blue"
     """Colours of garment, border paint and suit."""
@@ -318,4 +323,6 @@ class BoardConfig:
     board: str = "charuco:8x6:100:74:DICT_4X4_50"
     """charuco:COLUMNSxROWS:SQUARE_MM:MARKER_MM:DICTIONARY."""
     poses: Count = 24
+    """Of the board, one photograph of each camera in each."""
     seed: Seed = 0
+    """Everything random follows from it."""

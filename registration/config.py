@@ -250,7 +250,7 @@ SOFT = RegistrationConfig(
 class MeshRegistrationConfig:
     """Any template onto any scan."""
 
-    boundary_colour: str = ""
+    border_colour: str = ""
     """Paint on the scan's borders, RRGGBB; empty where none is painted."""
     units: Literal["m", "cm", "mm", "in", "auto"] = "auto"
     """Of both files; decides the millimetres of the report, never the result. auto: metres if the template's bounding

@@ -80,7 +80,7 @@ def run(
         raise InputError(
             f"expected a mesh file ({', '.join(WRITABLE)}), found '{output_path.suffix}'", where=output_path
         )
-    read_scan = read_coloured_mesh if config.boundary_colour else read_mesh
+    read_scan = read_coloured_mesh if config.border_colour else read_mesh
     template_file, scan_file = read_mesh(template_path), read_scan(scan_path, faces_needed=False)
     result = register_mesh(
         template_file.mesh,
@@ -126,7 +126,7 @@ def register_mesh(
 
     Args:
         scan: may have no faces; they are made between its points then.
-        colours: (S, 3) uint8 of the scan's vertices, needed for `config.boundary_colour`.
+        colours: (S, 3) uint8 of the scan's vertices, needed for `config.border_colour`.
         template_name, scan_name: how errors call them.
     """
     split = weld(template.vertices, template.faces)
@@ -152,8 +152,8 @@ def register_mesh(
         )
         start = motion.apply(start)
     loops = {f"border_{index}": loop for index, loop in enumerate(boundary_loops(template.faces))}
-    if config.boundary_colour and not loops:
-        raise InputError(f"{template_name}: expected open borders, for --boundary-colour is given; found none")
+    if config.border_colour and not loops:
+        raise InputError(f"{template_name}: expected open borders, for --border-colour is given; found none")
     garment = Garment(Mesh(start.astype(np.float32), template.faces), loops)
     analysis = analyse_template(garment, config.registration)
     frame = prepare_frame(analysis, garment_scan, config.registration)
@@ -210,11 +210,11 @@ def _garment_scan(
 ) -> GarmentScan:
     """The whole scan, with the border points that its paint shows."""
     mesh = Mesh(vertices.astype(np.float32), scan.faces)
-    if not config.boundary_colour:
+    if not config.border_colour:
         none = np.zeros((0, 3), np.float32)
         return GarmentScan(submesh(mesh, np.ones(len(mesh.faces), bool))[0], none, np.zeros(0, np.int32), (), 0)
     if colours is None:
-        raise InputError(f"{name}: expected a colour per vertex for --boundary-colour, found none")
+        raise InputError(f"{name}: expected a colour per vertex for --border-colour, found none")
     assert find_border is not None, "a painted border needs somebody who finds it"
-    points = find_border(mesh, colours, parse_colour(config.boundary_colour), source=name)
+    points = find_border(mesh, colours, parse_colour(config.border_colour), source=name)
     return GarmentScan(mesh, points, np.full(len(points), -1, np.int32), (), 0)

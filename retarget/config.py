@@ -54,6 +54,7 @@ class SplitConfig:
     gap_s: NonNegative = 0.5
     """Seconds left out on both sides of a cut, where one take has to be cut because it is the only one."""
     seed: Seed = 0
+    """Of the choice of takes to validate on."""
 
 
 @settings
@@ -143,6 +144,7 @@ class LstmConfig:
     layers: Count = 1
     """The paper has 4; on a thousand frames they generalise worse than one."""
     size: Count = 256
+    """Numbers in the state of a layer."""
     window: Count = 3
     """Frames in and frames out."""
     over_linear: bool = True
@@ -158,7 +160,9 @@ class TrainingConfig:
     epochs: Whole = 0
     """The learning rate falls to zero over them, along a cosine. 0: thirty, or as many as make 500 steps."""
     batch: Count = 128
+    """Windows in a step."""
     learning_rate: Positive = 1e-3
+    """Of AdamW, at the beginning."""
     weight_decay: NonNegative = 2.0
     """Decoupled from the gradient (AdamW)."""
     control_noise: NonNegative = 0.15
@@ -177,6 +181,7 @@ class TrainingConfig:
     threads: Count = 1
     """Threads of torch; results are the same bits only for the same number."""
     seed: Seed = 0
+    """Of the first weights, the order of the windows and the noise."""
 
 
 @settings
@@ -204,6 +209,7 @@ class RemovalConfig:
     """Taking the garment out of the body."""
 
     enabled: bool = True
+    """Take the garment out of the body."""
     margin_mm: NonNegative = 2.0
     """How far outside the body its vertices are put."""
     stay: Positive = 1.0

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 
 from capture4d.cli.main import main
+
+PROGRESS = re.compile(r"[\w -]+(, [\w -]+)?: (begins|(stopped|ends) after [\d:]+|\d+ of \d+(, | in ).*)")
+"""A line about how far the work is, where stderr is not a terminal."""
 
 
 def run(*arguments: str | Path) -> int:
@@ -24,6 +28,6 @@ def fails(capsys: pytest.CaptureFixture[str], *arguments: str | Path, code: int 
     assert given == code, said
     assert "Traceback" not in said
     *progress, line = said.splitlines()
-    assert all(" left " in each for each in progress), said
+    assert all(PROGRESS.fullmatch(each) for each in progress), said
     assert line.startswith("capture4d: ")
     return line.removeprefix("capture4d: ")

@@ -111,7 +111,7 @@ def _numbers(files: Sequence[Path], pattern: str | None) -> list[int | None]:
     if pattern is None:
         return frame_numbers([path.stem for path in files])
     if pattern.count("{frame}") != 1:
-        raise InputError(f"--frames: expected a file name with {{frame}} in it once, found '{pattern}'")
+        raise InputError(f"--pattern: expected a file name with {{frame}} in it once, found '{pattern}'")
     before, after = (re.escape(part) for part in pattern.split("{frame}"))
     named = re.compile(f"{before}([0-9]+){after}", re.IGNORECASE)
     matches = [named.fullmatch(path.name) for path in files]

@@ -7,9 +7,7 @@ Anything else is a bug and keeps its traceback.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import difflib
-import errno
 import os
 import signal
 import sys
@@ -18,8 +16,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-import tyro
-
+from capture4d.cli.answers import TerminatedError, answer_to, complain
 from capture4d.cli.commands.capture import Calibrate, Check, CheckRig
 from capture4d.cli.commands.doctor import Doctor
 from capture4d.cli.commands.files import ConvertBody, ConvertPoses, ConvertRig, RegisterMesh, Template
@@ -27,29 +24,16 @@ from capture4d.cli.commands.models import Animate, Fit
 from capture4d.cli.commands.stages import Extract, Register, Report, Run, Track
 from capture4d.cli.commands.synthesis import Demo, Scan, Synth, SynthBoard
 from capture4d.cli.commands.wrinkles import Compare, WrinklesApply, WrinklesMaps, WrinklesOffsets, WrinklesTrain
-from capture4d.cli.exit_codes import BAD_COMMAND_LINE, BAD_INPUT, GOOD, INTERRUPTED, TERMINATED
-from capture4d.cli.faults import check_command
-from capture4d.errors import CommandLineError, InputError
-from capture4d.runs.address_space import memory_fault, require_address_space
-from capture4d.settings import gathered_faults
+from capture4d.cli.exit_codes import BAD_COMMAND_LINE, BAD_INPUT, GOOD
+from capture4d.cli.help_text import command_help, overview
+from capture4d.cli.options import ProgressOptions, StageOptions, all_cores
+from capture4d.cli.parsing import command_options, parse
+from capture4d.runs.address_space import require_address_space
 from data_synth import config as synth_config
 from registration import config as registration_config
 from wrinkles.normal_maps import config as wrinkle_config
 
 __all__ = ["COMMANDS", "main"]
-
-# What a user's disk can answer; the message names the path, and a traceback would add nothing.
-_DISK_ANSWERS = {
-    errno.EACCES,
-    errno.EDQUOT,
-    errno.EEXIST,
-    errno.EISDIR,
-    errno.ENOENT,
-    errno.ENOSPC,
-    errno.ENOTDIR,
-    errno.EPERM,
-    errno.EROFS,
-}
 
 _ALLOW_OUTSIDE = "CAPTURE4D_ALLOW_OUTSIDE"
 """As `capture4d.files.reading` knows it, which loads more than the command line should."""
@@ -104,14 +88,10 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         sys.exit(_run(list(sys.argv[1:] if arguments is None else arguments)))
 
 
-class _TerminatedError(BaseException):
-    """SIGTERM, which a scheduler sends to a job whose time is up."""
-
-
 @contextlib.contextmanager
 def _answering_to_termination() -> Iterator[None]:
     def terminate(number: int, frame: object) -> None:
-        raise _TerminatedError
+        raise TerminatedError
 
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -128,82 +108,95 @@ def _run(arguments: list[str]) -> int:
         code = _dispatch(arguments)
         sys.stdout.flush()
         return code
-    except CommandLineError as error:
-        return _complain(str(error), code=BAD_COMMAND_LINE)
-    except InputError as error:
-        return _complain(str(error))
-    except BrokenPipeError:  # whoever read our output, such as `head`, has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return GOOD
-    except OSError as error:
-        if error.errno not in _DISK_ANSWERS or (error.filename is None and error.errno != errno.ENOSPC):
+    except BaseException as error:
+        answer = answer_to(error, arguments)
+        if answer is None:
             raise
-        kept = "; finished frames are kept, the same command goes on" if error.errno == errno.ENOSPC else ""
-        return _complain(f"{error.filename or 'output'}: {error.strerror}{kept}")
-    except RuntimeError as error:
-        from capture4d.runs.workers import WorkerDied
-
-        if not isinstance(error, WorkerDied):
-            raise
-        return _complain(str(error))
-    except (MemoryError, ImportError) as error:
-        said = memory_fault(error)
-        if said is None:
-            raise
-        return _complain(said)
-    except KeyboardInterrupt:
-        return _complain("interrupted; finished frames are kept, the same command goes on", code=INTERRUPTED)
-    except _TerminatedError:
-        return _complain("terminated; finished frames are kept, the same command goes on", code=TERMINATED)
+        return answer
 
 
 def _dispatch(arguments: list[str]) -> int:
-    if not arguments or arguments[0] in ("-h", "--help"):
-        print(_overview())
+    if not arguments or arguments[0] in ("-h", "--help", "--help-all"):
+        print(overview(COMMANDS))
         return GOOD if arguments else BAD_COMMAND_LINE
     if arguments[0] == "--version":
         from importlib.metadata import version
 
         print(f"capture4d {version('capture4d')}")
         return GOOD
+    if arguments[0] == "help":
+        return _help(arguments[1:])
     name, *rest = arguments
     if any(command.startswith(f"{name} ") for command in COMMANDS):  # a group, such as `wrinkles train`
-        if not rest or rest[0] in ("-h", "--help"):
-            print(_overview(f"{name} "))
+        if not rest or rest[0] in ("-h", "--help", "--help-all"):
+            print(overview(COMMANDS, f"{name} "))
             return GOOD if rest else BAD_COMMAND_LINE
         name, rest = f"{name} {rest[0]}", rest[1:]
     if name not in COMMANDS:
         near = difflib.get_close_matches(name, COMMANDS, n=1)
         hint = f"; did you mean '{near[0]}'?" if near else ""
-        return _complain(f"unknown command '{name}'{hint} (see capture4d --help)", code=BAD_COMMAND_LINE)
-    command = _parse(name, rest)
+        return complain(f"unknown command '{name}'{hint} (see capture4d --help)", code=BAD_COMMAND_LINE)
+    kind, presets = COMMANDS[name], _PRESETS.get(COMMANDS[name])
+    if {"-h", "--help", "--help-all"} & {*rest}:
+        print(command_help(name, kind, command_options(kind, rest, presets), experts="--help-all" in rest))
+        return GOOD
+    command = parse(name, kind, rest, presets)
     require_address_space(name)
-    with _allowing(command), _alone(command):
+    with _showing(command), _allowing(command), _alone(command):
+        return _logged(command, arguments)
+
+
+def _help(words: list[str]) -> int:
+    """`capture4d help`, `help TOPIC` and `help COMMAND`."""
+    from capture4d.cli.topics import TOPICS, list_of_topics, topic_text
+
+    asked = " ".join(words)
+    if not asked:
+        print(list_of_topics())
+        return GOOD
+    if asked in TOPICS:
+        print(topic_text(asked))
+        if asked in COMMANDS:
+            print(f"Options: capture4d {asked} --help")
+        return GOOD
+    if asked in COMMANDS or any(command.startswith(f"{asked} ") for command in COMMANDS):
+        return _dispatch([*words, "--help"])
+    near = difflib.get_close_matches(asked, [*TOPICS, *COMMANDS], n=1)
+    hint = f"; did you mean '{near[0]}'?" if near else ""
+    return complain(f"no help on '{asked}'{hint} (see capture4d help)", code=BAD_COMMAND_LINE)
+
+
+@contextlib.contextmanager
+def _showing(command: Any) -> Iterator[None]:
+    """Progress as the command line wants it."""
+    if not isinstance(command, ProgressOptions):
+        yield
+        return
+    from capture4d.runs.progress import progress_style
+
+    with progress_style(command.style):
+        yield
+
+
+def _logged(command: Any, arguments: list[str]) -> int:
+    """Run the command, with a log in its work folder, if it has one."""
+    folder = _log_folder(command)
+    if folder is None:
         return command()
+    from capture4d.runs.run_log import run_log
 
-
-def _parse(name: str, arguments: list[str]) -> Any:
-    """The command with its options. A --preset decides what the other settings start from.
-
-    Raises:
-        InputError: an option is out of range.
-    """
-    command = COMMANDS[name]
-    presets = _PRESETS.get(command)
-    default = None
-    if presets:
-        given = _value_of("--preset", arguments) or next(iter(presets))
-        if given in presets:
-            required = {
-                entry.name: tyro.MISSING
-                for entry in dataclasses.fields(command)
-                if entry.default is entry.default_factory is dataclasses.MISSING
-            }
-            default = command(**required, preset=given, config=presets[given])
-    with gathered_faults() as faults:  # tyro would print a page about each
-        parsed = tyro.cli(command, prog=f"capture4d {name}", args=arguments, default=default)
-    check_command(parsed, faults, arguments)
-    return parsed
+    with run_log(folder, arguments, command, cores=all_cores()) as log:
+        try:
+            code = command()
+        except BaseException as error:
+            answer = answer_to(error, arguments)
+            log.fault(error)
+            log.end(BAD_INPUT if answer is None else answer)  # Python's own code, of a bug
+            if answer is None:
+                raise
+            return answer
+        log.end(code)
+        return code
 
 
 @contextlib.contextmanager
@@ -234,6 +227,17 @@ def _written_by(command: Any) -> Path | None:
     return getattr(command, "output", None) or (work if work is not None and work.is_dir() else None)
 
 
+def _log_folder(command: Any) -> Path | None:
+    """The folder of a command's log: the work folder, or the model's; None of a command that writes anything else."""
+    if isinstance(command, _WRITE_FILES) or not isinstance(command, StageOptions):
+        return None
+    if isinstance(command, Synth | Scan | SynthBoard):  # equal settings give equal folders, byte for byte
+        return None
+    if isinstance(command, Fit) and command.output is None:
+        return next(iter(command.works), None)
+    return getattr(command, "output", None) or getattr(command, "work", None)
+
+
 @contextlib.contextmanager
 def _allowing(command: Any) -> Iterator[None]:
     """What a command allows its readers is told by the environment, which worker processes inherit."""
@@ -247,36 +251,3 @@ def _allowing(command: Any) -> Iterator[None]:
             os.environ.pop(_ALLOW_OUTSIDE, None)
         else:
             os.environ[_ALLOW_OUTSIDE] = before
-
-
-def _value_of(option: str, arguments: list[str]) -> str | None:
-    for index, argument in enumerate(arguments):
-        if argument == option:
-            return next(iter(arguments[index + 1 :]), None)
-        if argument.startswith(f"{option}="):
-            return argument.partition("=")[2]
-    return None
-
-
-def _overview(group: str = "") -> str:
-    lines = [
-        f"  {name:<17} {(command.__doc__ or '').splitlines()[0]}"
-        for name, command in COMMANDS.items()
-        if name.startswith(group)
-    ]
-    return "\n".join(
-        [
-            "usage: capture4d COMMAND ...",
-            "",
-            "4D garment capture: registration of coloured scans, learned garments, and a synthetic 4D scanner.",
-            "",
-            *lines,
-            "",
-            "capture4d COMMAND --help lists a command's options. Every command resumes where it was stopped.",
-        ]
-    )
-
-
-def _complain(message: str, *, code: int = BAD_INPUT) -> int:
-    print(f"capture4d: {' '.join(message.splitlines())}", file=sys.stderr)
-    return code

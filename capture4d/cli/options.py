@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import os
-import sys
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from capture4d.cli.exit_codes import BAD_RESULT, GOOD
+from capture4d.cli.verdict import say_flagged
+from capture4d.errors import CommandLineError
 from capture4d.settings import Count, Percent
 
 if TYPE_CHECKING:
+    from capture4d.runs.progress import Style
     from capture4d.runs.stage import StageResult
 
-__all__ = ["GradedOptions", "MeshOptions", "StageOptions", "all_cores"]
+__all__ = ["GradedOptions", "MeshOptions", "ProgressOptions", "StageOptions", "all_cores"]
 
 
 def all_cores() -> int:
@@ -30,7 +32,29 @@ class MeshOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class StageOptions:
+class ProgressOptions:
+    """Of commands that take long enough to say how far they are: a bar on a terminal, lines elsewhere."""
+
+    quiet: bool = False
+    """Say nothing of progress: only verdicts and faults."""
+    json_progress: bool = False
+    """Say it as JSON, one object a line on stderr, for machines."""
+
+    @property
+    def style(self) -> Style:
+        """
+        Raises:
+            CommandLineError: it cannot be both.
+        """
+        if self.quiet and self.json_progress:
+            raise CommandLineError("--json-progress: expected to be without --quiet, found both")
+        return "quiet" if self.quiet else "json" if self.json_progress else "auto"
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageOptions(ProgressOptions):
+    """Of stages: how they are run."""
+
     workers: Count = field(default_factory=all_cores)
     """Processes to use; the result does not depend on it."""
     overwrite: bool = False
@@ -50,9 +74,8 @@ class GradedOptions(StageOptions):
         """The exit code of a finished stage; says on stderr what is wrong with it."""
         if not result.failed:
             return GOOD
-        frame_id, reason = next(iter(result.failed.items()))
         count = f"{len(result.failed)} of {result.frames} frames failed ({result.failed_percent:.3g} %"
         broken = result.failed_percent > self.max_failed
         limit = f", more than the {self.max_failed:g} % allowed" if broken else ""
-        print(f"capture4d: {count}{limit}); frame {frame_id}: {reason}", file=sys.stderr)
+        say_flagged(f"{count}{limit})", result.failed)
         return BAD_RESULT if broken else GOOD

@@ -1,4 +1,4 @@
-"""A pool of local workers with a progress bar: one thread each, and none outlives the command."""
+"""A pool of local workers that tell how far they are: one thread each, and none outlives the command."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ from functools import partial
 from multiprocessing.connection import wait
 from typing import Any, TypeVar, overload
 
-__all__ = ["WorkerDied", "progress", "run_jobs", "shared"]
+from capture4d.runs.progress import progress
+
+__all__ = ["WorkerDied", "run_jobs", "shared"]
 
 Job = TypeVar("Job")
 Prepared = TypeVar("Prepared")
@@ -65,7 +67,7 @@ def run_jobs(
     units: Callable[[Job], int] | None = None,
     finished: Callable[[], int] | None = None,
 ) -> Iterator[Result]:
-    """Run `function` on every job and yield the results as they come, with a progress bar on stderr.
+    """Run `function` on every job and yield the results as they come; `capture4d.runs.progress` shows how far it is.
 
     Args:
         function: importable by name, as are its jobs and results, for they travel to new processes.
@@ -167,50 +169,3 @@ def _start_worker(function: Callable[..., Any], prepare: Callable[[], Any] | Non
         os._exit(1)
 
     threading.Thread(target=end_with_parent, daemon=True).start()
-
-
-@contextlib.contextmanager
-def progress(
-    label: str, total: int, finished: Callable[[], int] | None = None, *, completed: int = 0
-) -> Iterator[Callable[[int], None]]:
-    """A progress bar with the time left, on stderr; call what it yields with the units just done.
-
-    Args:
-        finished: units done so far, read from disk once a second, instead of calls.
-        completed: units that were done before.
-    """
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    columns = (
-        TextColumn("{task.description:<24}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-    )
-    stop = threading.Event()
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        task = bar.add_task(label, total=total, completed=completed)
-        before = finished() if finished else 0
-
-        def poll() -> None:
-            while finished and not stop.wait(1.0):
-                bar.update(task, completed=min(finished() - before, total))
-
-        poller = threading.Thread(target=poll, daemon=True)
-        poller.start()
-        try:
-            yield lambda count: None if finished else bar.advance(task, count)
-            bar.update(task, completed=total)
-        finally:
-            stop.set()
-            poller.join()

@@ -37,8 +37,9 @@ from capture4d.files.atomic import (
 )
 from capture4d.files.records import load_body, save_body, save_poses
 from capture4d.motions.motion_files import read_motion, told
+from capture4d.runs.progress import progress
 from capture4d.runs.stage import Stage, StageResult, open_stage
-from capture4d.runs.workers import progress, run_jobs
+from capture4d.runs.workers import run_jobs
 from capture4d.tracking.config import SequenceConfig, TrackingConfig
 from capture4d.tracking.limbs import guessed_limbs, unseen_limbs
 from capture4d.tracking.scan_points import ScanPoints, scan_points

@@ -87,7 +87,9 @@ class FusionConfig:
     """Fusion of the depth images by truncated signed distances, and the cleaning of the result."""
 
     garment_voxel_m: Positive = 0.0027
+    """Edge of a voxel near the garment, metres."""
     body_voxel_m: Positive = 0.005
+    """The same near the body."""
     truncation_voxels: Positive = 3.0
     """Open3D's default of 8 lets both sides of a sleeve interfere: four times the error."""
     min_weight: NonNegative = 2.0
@@ -164,7 +166,7 @@ class ScanConfig:
     """How a sequence of meshes becomes a capture."""
 
     height_m: Positive | None = None
-    """Scale the sequence so that its first frame is this tall; None keeps the sizes as metres."""
+    """Scale the sequence so that its first frame is this tall; if absent, sizes are metres."""
     up: Literal["x", "y", "z"] = "y"
     """The axis of the meshes that points up."""
     fps: Positive = 60.0
@@ -172,7 +174,7 @@ class ScanConfig:
     first_frame: Whole = 0
     """Index of the first mesh to scan."""
     frames: Count | None = None
-    """How many meshes to scan; None scans all."""
+    """How many meshes to scan; all if absent."""
     step: Count = 1
     """Scan every n-th mesh."""
     garment_colour: str = "#2f62c9"
@@ -182,7 +184,7 @@ class ScanConfig:
     border_colours: tuple[str, ...] = ("#ffd200", "#e5332a", "#31b04a", "#f07be0", "#35c6d6", "#f28c1e")
     """Paint of the border loops, the longest loop first; fewer colours than loops are used in turn."""
     template_vertices: Annotated[int, Range(least=4)] | None = None
-    """Size of the template, made from the first frame by decimation; None takes the first mesh itself. Ignored where a
+    """Size of the template, made from the first frame by decimation; the first mesh itself if absent. Ignored where a
     template is given."""
     seed: Seed = 0
     """Of the sensor noise."""

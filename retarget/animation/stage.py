@@ -42,7 +42,7 @@ INSIDE_CHECK_PERCENT = 0.3
 """A frame with more of its vertices inside the body, after all, is flagged."""
 STRETCH_CHECK, STRETCH_FAIL = 1.4, 2.5
 """A frame with edges so much longer than the mean garment's, 99th percentile, is flagged, or has failed: cloth does not
-stretch like that. The limits are registration's (`--quality.stretch-check`, `--quality.stretch-fail`)."""
+stretch like that. The limits are registration's (`quality.stretch_check`, `quality.stretch_fail`)."""
 
 
 @dataclass(frozen=True, slots=True)

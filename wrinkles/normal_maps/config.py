@@ -86,8 +86,11 @@ class LossConfig:
     """L = gan * L_GAN + data * L_data + temporal * L_temp (DeepWrinkles, Eq. 3-4)."""
 
     gan: NonNegative = 1.0
+    """Weight of the adversarial loss."""
     data: NonNegative = 100.0
+    """Weight of the difference from the high map."""
     temporal: NonNegative = 50.0
+    """Weight of the temporal loss."""
     temporal_kind: TemporalLoss = "printed"
     """`printed` is Eq. 4, the net change of each channel; l1 and l2 compare texel by texel. The small presets take l2,
     with which maps are better and flicker less (`python -m benchmarks wrinkles`)."""
@@ -108,15 +111,21 @@ class ScheduleConfig:
     """How long to train, and what to keep."""
 
     steps: Count = 20_000
+    """Of training."""
     batch: Count = 1
+    """Frames in a step."""
     learning_rate: Positive = 2e-4
+    """Of Adam."""
     beta1: Part = 0.5
+    """Of Adam, decay of its first moment."""
     decay_from: Share = 0.5
     """Share of the steps after which the learning rate falls linearly to zero."""
     checkpoint_every: Count = 500
+    """Steps between checkpoints."""
     sample_every: Count = 500
     """Steps between sheets of sample maps."""
     log_every: Count = 20
+    """Steps between lines of metrics.jsonl."""
     half_precision: bool = False
     """Compute in bfloat16 where torch thinks it safe; on a CPU it pays from 32 filters up."""
 
@@ -126,6 +135,7 @@ class WrinkleConfig:
     """Learning high-resolution normal maps from low ones."""
 
     seed: Seed = 0
+    """Of the first weights and of the order of the frames."""
     held_out: Part = 0.1
     """Share at the end of every take that is left out of training, to be drawn and measured."""
     held_out_gap: Whole = 10

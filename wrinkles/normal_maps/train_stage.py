@@ -22,8 +22,8 @@ from capture4d.captures.work_folder import WorkFolder
 from capture4d.errors import InputError
 from capture4d.files.atomic import nan_to_none, read_json, read_json_lines, write_bytes, write_json, write_json_lines
 from capture4d.geometry.uv_layout import millimetres_per_texel
+from capture4d.runs.progress import progress
 from capture4d.runs.stage import Stage, StageResult, open_stage
-from capture4d.runs.workers import progress
 from capture4d.types import Mesh
 from wrinkles.normal_maps.config import PairConfig, WrinkleConfig
 from wrinkles.normal_maps.inference import WrinkleModel, save_model

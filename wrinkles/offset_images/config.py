@@ -15,7 +15,9 @@ class OffsetTrainingConfig:
     """How the decoder and its baselines learn. Adam at 1e-3; the paper does not say the rest."""
 
     seed: Seed = 0
+    """Of the first weights and of the order of the frames."""
     epochs: Count = 30
+    """How often every frame is learned from."""
     batch: Annotated[int, Range(least=2)] = 16
     """Frames at most: a short take is learned from in eight batches, unless they would be too small for batch norm."""
     learning_rate: Positive = 1e-3
@@ -23,6 +25,7 @@ class OffsetTrainingConfig:
     norm: Literal["l1", "l2"] = "l2"
     """Of the three channels of a texel, in the grid loss; l2 is not squared."""
     normal_weight: NonNegative = 0.01
+    """Weight of the normals' loss, beside 1 of the offsets'."""
     patience: Count = 12
     """Epochs without a better validation error after which training stops."""
     centred: bool = True

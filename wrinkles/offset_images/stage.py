@@ -28,8 +28,8 @@ from capture4d.captures.work_folder import WorkFolder
 from capture4d.errors import InputError
 from capture4d.files.atomic import write_bytes, write_json
 from capture4d.learning.checkpoints import read_checkpoint, write_checkpoint
+from capture4d.runs.progress import progress
 from capture4d.runs.stage import Stage, StageResult, open_stage
-from capture4d.runs.workers import progress
 from wrinkles.frame_split import split_rows
 from wrinkles.offset_images.config import OffsetConfig, OffsetTrainingConfig
 from wrinkles.offset_images.layout import OffsetLayout

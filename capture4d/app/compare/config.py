@@ -16,7 +16,7 @@ class CompareConfig:
     held_out: Annotated[float, Range(above=0, below=1)] = 0.2
     """Share of frames at the end of the take that are compared. A network that learned from the take keeps its own
     split, and so do, if it did not, the offset images."""
-    gap: Whole = 10
+    held_out_gap: Whole = 10
     """Frames between the two that belong to neither."""
     pictures: Count = 3
     """Held-out frames drawn."""

@@ -101,7 +101,7 @@ def open_inputs(
     if pairs.layout_digest != generator.layout_digest:
         raise InputError(f"expected maps laid out as {weights} has them ({generator.maps}), found {pairs.maps}",
                          where=pairs.path)  # fmt: skip
-    held_out, gap = _network_split(weights, pairs) or _offsets_split(offsets) or (config.held_out, config.gap)
+    held_out, gap = _network_split(weights, pairs) or _offsets_split(offsets) or (config.held_out, config.held_out_gap)
     return Inputs(work, pairs, template, generator, known, offsets, upstream, held_out, gap)
 
 

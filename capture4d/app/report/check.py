@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, Literal
 
+from capture4d.captures.frame_ranges import frame_ranges
 from capture4d.preflight.check import Checked
 from capture4d.preflight.findings import Verdict
 
@@ -56,6 +56,13 @@ def _learns(checked: Checked) -> bool:
     return checked.take.facts.paints.garment is None
 
 
+def _counted(verdict: Verdict) -> str:
+    """Such as "2 errors, 1 warning"."""
+    grades = [finding.severity for finding in verdict.findings]
+    counts = {grade: grades.count(grade) for grade in ("error", "warning")}
+    return ", ".join(f"{count} {grade}{'s' if count > 1 else ''}" for grade, count in counts.items() if count)
+
+
 def print_table(checked: Checked) -> None:
     from rich.console import Console
     from rich.table import Table
@@ -65,22 +72,11 @@ def print_table(checked: Checked) -> None:
     if checked.verdict.findings:
         table = Table("", "finding", "what was found", "what to do", title=f"{checked.take.path} ({looked} looked at)")
         for finding in checked.verdict.findings:
-            frames = f"\nframes {_ranges(finding.frames)}" if finding.frames else ""
+            frames = f"\nframes {frame_ranges(finding.frames, most=6)}" if finding.frames else ""
             table.add_row(finding.severity, finding.code, finding.found + frames, finding.advice)
         console.print(table)
+        console.print(f"check: {looked} looked at; {_counted(checked.verdict)}", highlight=False, soft_wrap=True)
     else:
         console.print(f"{checked.take.path}: clean ({looked} looked at)", highlight=False, soft_wrap=True)
     if _learns(checked):
         console.print(LEARNED, highlight=False, soft_wrap=True)
-
-
-def _ranges(numbers: Sequence[int], most: int = 6) -> str:
-    """'3-5, 9, ...'"""
-    runs: list[list[int]] = []
-    for number in numbers:
-        if runs and number == runs[-1][1] + 1:
-            runs[-1][1] = number
-        else:
-            runs.append([number, number])
-    shown = [str(a) if a == b else f"{a}-{b}" for a, b in runs[:most]]
-    return ", ".join(shown + ["..."] * (len(runs) > most))

@@ -11,19 +11,19 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from capture4d.calibration.config import CalibrationConfig, RigCheckConfig
 from capture4d.cli.exit_codes import BAD_RESULT, GOOD
-from capture4d.cli.options import MeshOptions, all_cores
+from capture4d.cli.options import MeshOptions, ProgressOptions, all_cores
 from capture4d.settings import Count, Positive
 
 __all__ = ["Calibrate", "Check", "CheckRig"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Check(MeshOptions):
+class Check(ProgressOptions, MeshOptions):
     """Look through a take before a night is spent on it; exit code 3 if it has errors."""
 
     capture: Annotated[Positional[Path], arg(metavar="CAPTURE")]
     """Capture folder, or just a folder of scans."""
-    frames: str | None = None
+    pattern: str | None = None
     """How scans are named, such as "take_{frame}.ply"; else the last number in a name that differs is the frame's."""
     fps: Positive | None = None
     """Frame rate, if capture.json does not say, or is to be doubted."""
@@ -59,7 +59,7 @@ class Check(MeshOptions):
         from capture4d.preflight.take_folder import Claims
 
         claims = Claims(
-            self.frames,
+            self.pattern,
             self.fps,
             self.units,
             self.garment_colour,
@@ -81,7 +81,7 @@ class Check(MeshOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Calibrate:
+class Calibrate(ProgressOptions):
     """Calibrate a camera rig from images of a ChArUco board or a checkerboard, with a report of how good it is."""
 
     images: Annotated[Positional[Path], arg(metavar="IMAGES")]
@@ -121,7 +121,7 @@ class Calibrate:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CheckRig:
+class CheckRig(ProgressOptions):
     """Tell which cameras have moved since calibration, from one pose of the board; exit code 3 if one has."""
 
     rig: Annotated[Positional[Path], arg(metavar="RIG")]

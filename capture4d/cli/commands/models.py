@@ -10,6 +10,7 @@ from tyro.conf import Positional, arg
 
 from capture4d.cli.exit_codes import GOOD
 from capture4d.cli.options import GradedOptions, MeshOptions, StageOptions
+from capture4d.cli.verdict import say_verdict
 from capture4d.errors import CommandLineError
 from capture4d.settings import Number
 from retarget.config import AnimateConfig, FitConfig
@@ -79,5 +80,6 @@ class Animate(GradedOptions):
             workers=self.workers,
             overwrite=self.overwrite,
         )
+        say_verdict(result.path, "animate")
         print(f"registration: {result.path}")
         return self.graded(result)

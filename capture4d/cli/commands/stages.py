@@ -11,6 +11,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from capture4d.cli.exit_codes import BAD_RESULT, GOOD
 from capture4d.cli.options import GradedOptions, MeshOptions, StageOptions
+from capture4d.cli.verdict import say_flagged, say_verdict, say_work
 from capture4d.tracking.config import TrackingConfig
 from registration.config import RegistrationConfig
 
@@ -39,11 +40,10 @@ class Extract(StageOptions, MeshOptions):
             workers=self.workers,
             overwrite=self.overwrite,
         )
-        if result.failed:
-            frame_id, reason = next(iter(result.failed.items()))
-            print(f"capture4d: no garment in {len(result.failed)} frames, first in {frame_id}: {reason}",
-                  file=sys.stderr)  # fmt: skip
+        found = result.frames - len(result.failed)
+        say_flagged(f"no garment in {len(result.failed)} of {result.frames} frames", result.failed)
         _say_clouds(self.output)
+        print(f"extract: {found} of {result.frames} frames with a garment")
         print(f"garment: {result.path}")
         return GOOD
 
@@ -56,15 +56,14 @@ class Track(StageOptions, MeshOptions):
     """Capture folder."""
     output: Path
     """Work folder; gets body/."""
-    config: Annotated[TrackingConfig, arg(name="")] = field(default_factory=TrackingConfig)
+    config: Annotated[TrackingConfig, arg(name="tracking")] = field(default_factory=TrackingConfig)
 
     def __call__(self) -> int:
         from capture4d import pipeline
 
         result = pipeline.track(self.capture, self.output, self.config, workers=self.workers, overwrite=self.overwrite)
-        if result.failed:
-            frame_id, reason = next(iter(result.failed.items()))
-            print(f"capture4d: lost in {len(result.failed)} frames, first in {frame_id}: {reason}", file=sys.stderr)
+        say_flagged(f"lost in {len(result.failed)} of {result.frames} frames", result.failed)
+        say_verdict(result.path, "track")
         print(f"body: {result.path}")
         return GOOD
 
@@ -81,7 +80,7 @@ class Register(GradedOptions, MeshOptions):
     """Move the template with the body that `track` found, not with the poses the capture brings."""
     preset: Literal["default", "paper"] = "default"
     """What the settings below start from; `paper` is DeepWrinkles as printed."""
-    config: Annotated[RegistrationConfig, arg(name="")] = field(default_factory=RegistrationConfig)
+    config: Annotated[RegistrationConfig, arg(name="registration")] = field(default_factory=RegistrationConfig)
 
     def __call__(self) -> int:
         from capture4d import pipeline
@@ -94,6 +93,7 @@ class Register(GradedOptions, MeshOptions):
             workers=self.workers,
             overwrite=self.overwrite,
         )
+        say_verdict(result.path, "register")
         print(f"registration: {result.path}")
         return self.graded(result)
 
@@ -108,8 +108,8 @@ class Run(GradedOptions, MeshOptions):
     """Work folder."""
     preset: Literal["default", "paper"] = "default"
     """What the settings of the registration start from; `paper` is DeepWrinkles as printed."""
-    track: bool = False
-    """Track the body even if the capture brings poses."""
+    tracked: bool = False
+    """Track the body, and move the template with it, even if the capture brings poses."""
     config: Annotated[RegistrationConfig, arg(name="registration")] = field(default_factory=RegistrationConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
 
@@ -121,11 +121,12 @@ class Run(GradedOptions, MeshOptions):
             self.output,
             self.config,
             tracking=self.tracking,
-            tracked=self.track,
+            tracked=self.tracked,
             workers=self.workers,
             overwrite=self.overwrite,
         )
         _say_clouds(self.output)
+        say_work(self.output)
         print(f"report: {result.path}")
         return self.graded(result)
 

@@ -31,7 +31,7 @@ class WrinklesMaps(StageOptions, MeshOptions):
     """Work folder; holds garment/ and registration/, gets wrinkles/pairs/."""
     high_from: Path | None = None
     """Work folder of the same frames, with finished maps, whose high ones are taken."""
-    config: Annotated[PairConfig, arg(name="")] = field(default_factory=PairConfig)
+    config: Annotated[PairConfig, arg(name="pairs")] = field(default_factory=PairConfig)
 
     def __call__(self) -> int:
         from capture4d import pipeline

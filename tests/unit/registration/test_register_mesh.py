@@ -74,7 +74,7 @@ def test_painted_borders_are_measured(garment, scan_of, quick) -> None:
         scan,
         colours=colours,
         find_border=painted_border,
-        config=replace(quick, boundary_colour="ffd200", units="m"),
+        config=replace(quick, border_colour="ffd200", units="m"),
     )
     assert result.quality.numbers["boundary_mean_mm"] < 4
 
@@ -91,7 +91,7 @@ def test_paint_may_be_in_a_texture(garment, scan_of, quick, tmp_path: Path) -> N
     (tmp_path / "scan.mtl").write_text("newmtl a\nmap_Kd t.png\n")
     text = (tmp_path / "scan.obj").read_text()
     (tmp_path / "scan.obj").write_text("mtllib scan.mtl\nusemtl a\n" + text)
-    painted = replace(quick, boundary_colour="ffd200", units="m")
+    painted = replace(quick, border_colour="ffd200", units="m")
     files = tmp_path / "template.obj", tmp_path / "scan.obj", tmp_path / "out.ply"
     result = run(*files, painted, find_border=painted_border)
     assert result.quality.numbers["boundary_mean_mm"] < 4
@@ -113,7 +113,7 @@ def test_alignment_comes_first_when_asked_for(garment, scan_of, quick) -> None:
 
 def test_refusals(garment, scan_of, quick) -> None:
     template, scan = garment.template, scan_of(swell).mesh
-    painted = replace(quick, boundary_colour="ffd200")
+    painted = replace(quick, border_colour="ffd200")
     with pytest.raises(InputError, match=r"scan: expected a colour per vertex"):
         register_mesh(template, scan, config=painted)
     grey = np.full((len(scan.vertices), 3), 128, np.uint8)

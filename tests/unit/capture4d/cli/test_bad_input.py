@@ -146,7 +146,9 @@ def test_motion_of_another_skeleton(tube_capture: Path, tmp_path: Path, capsys: 
     save_body(tube_capture / "body.npz", load_anny())
     poses = motion(tuple(SMPL_TREE), (5, 6, 7))
     save_poses(tmp_path / "start.npz", poses)
-    said = fails(capsys, "track", tube_capture, "--output", tmp_path / "work", "--start", tmp_path / "start.npz")
+    said = fails(
+        capsys, "track", tube_capture, "--output", tmp_path / "work", "--tracking.start", tmp_path / "start.npz"
+    )
     assert "start.npz: expected the body's 36 joints" in said
 
     save_poses(tube_capture / "poses.npz", poses)
@@ -169,14 +171,14 @@ def test_what_cannot_be_tracked(tube_capture: Path, tmp_path: Path, capsys: pyte
     work = tmp_path / "work"
     assert "nowhere: no such capture folder" in fails(capsys, *track(Path("nowhere"), work))
     assert "expected search, rest or a motion file, found 'sit'" in fails(
-        capsys, *track(tube_capture, work, "--start", "sit")
+        capsys, *track(tube_capture, work, "--tracking.start", "sit")
     )
     (tube_capture / "body.npz").write_bytes(b"PK")
-    assert "body.npz: not a readable npz file" in fails(capsys, *track(tube_capture, work, "--start", "rest"))
+    assert "body.npz: not a readable npz file" in fails(capsys, *track(tube_capture, work, "--tracking.start", "rest"))
     (tube_capture / "body.npz").unlink()
     for path in (tube_capture / "scans").iterdir():
         path.write_bytes(b"ply")
-    assert "000005.ply: " in fails(capsys, *track(tube_capture, tmp_path / "work2", "--start", "rest"))
+    assert "000005.ply: " in fails(capsys, *track(tube_capture, tmp_path / "work2", "--tracking.start", "rest"))
     assert not (tmp_path / "work2" / "body" / "poses.npz").exists()
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from capture4d.cli.main import main
+from tests.command_line import fails
 
 INPUTS = {
     "register": ("no-capture", "--output", "out"),
@@ -21,23 +22,55 @@ INPUTS = {
     "convert-poses": ("no.bvh", "out.npz"),
     "register-mesh": ("no.ply", "no.ply", "--output", "out.ply"),
 }
-SAME = "--coarse.compression 2 --dense.compression"  # two classes, one field name each
+SAME = "--registration.coarse.compression 2 --registration.dense.compression"  # two classes, one field name each
 
 
 @pytest.mark.parametrize(
     ("command", "options", "said"),
     [
-        ("register", "--graph.nodes -3", "--graph.nodes: expected at least 1, found -3"),
-        ("register", "--graph.nodes=-3", "--graph.nodes: expected at least 1, found -3"),
-        ("register", "--dense.cold.steps -2", "--dense.cold.steps: expected at least 0, found -2"),
-        ("register", "--sequence.segment -5", "--sequence.segment: expected at least 1, found -5"),
-        ("register", "--data.robust-scale 0", "--data.robust-scale: expected a positive number, found 0"),
-        ("register", "--graph.nodes-per-vertex 0", "--graph.nodes-per-vertex: expected at least 1, found 0"),
-        ("register", "--graph.nodes_per_vertex 0", "--graph.nodes_per_vertex: expected at least 1, found 0"),
-        ("register", "--preset paper --coarse.warm.steps -1", "--coarse.warm.steps: expected at least 0, found -1"),
-        ("register", "--coarse.cold.gate 0.1 -0.1", "--coarse.cold.gate: expected a positive number, found -0.1"),
-        ("register", "--coarse.cold.gate 0.1 nan", "--coarse.cold.gate: expected a finite number, found nan"),
-        ("register", f"{SAME} -1", "--dense.compression: expected at least 0, found -1"),
+        ("register", "--registration.graph.nodes -3", "--registration.graph.nodes: expected at least 1, found -3"),
+        ("register", "--registration.graph.nodes=-3", "--registration.graph.nodes: expected at least 1, found -3"),
+        (
+            "register",
+            "--registration.dense.cold.steps -2",
+            "--registration.dense.cold.steps: expected at least 0, found -2",
+        ),
+        (
+            "register",
+            "--registration.sequence.segment -5",
+            "--registration.sequence.segment: expected at least 1, found -5",
+        ),
+        (
+            "register",
+            "--registration.data.robust-scale 0",
+            "--registration.data.robust-scale: expected a positive number, found 0",
+        ),
+        (
+            "register",
+            "--registration.graph.nodes-per-vertex 0",
+            "--registration.graph.nodes-per-vertex: expected at least 1, found 0",
+        ),
+        (
+            "register",
+            "--registration.graph.nodes_per_vertex 0",
+            "--registration.graph.nodes_per_vertex: expected at least 1, found 0",
+        ),
+        (
+            "register",
+            "--preset paper --registration.coarse.warm.steps -1",
+            "--registration.coarse.warm.steps: expected at least 0, found -1",
+        ),
+        (
+            "register",
+            "--registration.coarse.cold.gate 0.1 -0.1",
+            "--registration.coarse.cold.gate: expected a positive number, found -0.1",
+        ),
+        (
+            "register",
+            "--registration.coarse.cold.gate 0.1 nan",
+            "--registration.coarse.cold.gate: expected a finite number, found nan",
+        ),
+        ("register", f"{SAME} -1", "--registration.dense.compression: expected at least 0, found -1"),
         ("register", "--workers 0", "--workers: expected at least 1, found 0"),
         ("run", "--registration.graph.nodes 0", "--registration.graph.nodes: expected at least 1, found 0"),
         ("run", "--tracking.fit.normal-cosine 2", "--tracking.fit.normal-cosine: expected from -1 to 1, found 2"),
@@ -71,11 +104,7 @@ def test_one_line_and_nothing_is_written(
     monkeypatch: pytest.MonkeyPatch,
 ):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as exit_:
-        main([*command.split(), *INPUTS[command], *options.split()])
-    (line,) = capsys.readouterr().err.splitlines()
-    assert exit_.value.code == 1
-    assert line.startswith(f"capture4d: {said}")
+    assert fails(capsys, *command.split(), *INPUTS[command], *options.split()).startswith(said)
     assert not list(tmp_path.iterdir())
 
 

@@ -465,7 +465,7 @@ def test_unusable_frames_are_left_out(sound: dict[int, Scan], tmp_path: Path, ca
 def test_a_folder_of_scans_is_enough(sound: dict[int, Scan], tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     for number, scan in sound.items():
         write_mesh(tmp_path / f"take_{number}_v2.ply", scan.mesh, colours=scan.colours)
-    command = (tmp_path, "--frames", "take_{frame}_v2.ply")
+    command = (tmp_path, "--pattern", "take_{frame}_v2.ply")
     code, found = check(capsys, *command, "--garment-colour", "#2f62c9")
     assert (code, found["frames"], found["colours"]) == (0, 5, "given")
     assert check(capsys, *command)[1]["colours"] == "learned"
@@ -477,8 +477,8 @@ def test_a_folder_of_scans_is_enough(sound: dict[int, Scan], tmp_path: Path, cap
 @pytest.mark.parametrize(
     ("options", "text", "said"),
     [
-        (["--frames", "scan.ply"], None, "expected a file name with {frame} in it once"),
-        (["--frames", "other_{frame}.ply"], None, "expected scans named other_{frame}.ply, found none"),
+        (["--pattern", "scan.ply"], None, "expected a file name with {frame} in it once"),
+        (["--pattern", "other_{frame}.ply"], None, "expected scans named other_{frame}.ply, found none"),
         ([], "{", "not valid JSON"),
         ([], "[]", "expected a JSON object"),
         ([], '{"fps": -1}', "expected a positive frame rate"),

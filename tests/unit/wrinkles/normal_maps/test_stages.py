@@ -87,7 +87,7 @@ def work(trained_once: Path, tmp_path: Path) -> Path:
 
 
 def test_maps_are_written_as_they_were_computed(work: Path, garment: Garment):
-    assert run("wrinkles", "maps", work, "--map.size", "128", "--workers", "1") == 0
+    assert run("wrinkles", "maps", work, "--pairs.map.size", "128", "--workers", "1") == 0
     pairs = work / "wrinkles" / "pairs"
     assert [path.name for path in sorted((pairs / "high").iterdir())] == [f"{frame:06d}.png" for frame in range(1, 7)]
     template = MapTemplate.create(garment, MapConfig(size=128))
@@ -109,7 +109,7 @@ def test_maps_are_written_as_they_were_computed(work: Path, garment: Garment):
 
 @pytest.mark.parametrize("which", ["low", "high"])
 def test_maps_lost_are_made_again_alike(work: Path, which: str):
-    arguments = ("wrinkles", "maps", work, "--map.size", "64", "--workers", "1")
+    arguments = ("wrinkles", "maps", work, "--pairs.map.size", "64", "--workers", "1")
     assert run(*arguments) == 0
     path = work / "wrinkles" / "pairs" / which / "000003.png"
     before = path.read_bytes()
@@ -141,7 +141,7 @@ def test_an_animation_borrows_the_high_maps_of_the_take_it_follows(
     work: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     """The low map is its own; the high one says the same in the world as that of the take."""
-    size = ("--map.size", "64", "--workers", "1")
+    size = ("--pairs.map.size", "64", "--workers", "1")
     animated = turned_copy(work, tmp_path / "animated", [2, 3, 9])
     arguments = ("wrinkles", "maps", animated, "--high-from", work, *size)
     missing = f"{work / 'wrinkles' / 'pairs'}: expected the output of 'wrinkles maps', found none"
@@ -161,7 +161,7 @@ def test_an_animation_borrows_the_high_maps_of_the_take_it_follows(
     other = turned_copy(work, tmp_path / "other", [20, 21])
     assert "expected frames of" in fails(capsys, "wrinkles", "maps", other, "--high-from", work, *size)
     larger = turned_copy(work, tmp_path / "larger", [2])
-    said = fails(capsys, "wrinkles", "maps", larger, "--high-from", work, "--map.size", "128")
+    said = fails(capsys, "wrinkles", "maps", larger, "--high-from", work, "--pairs.map.size", "128")
     assert "expected a map of 128 texels, found 64" in said
 
 
@@ -222,7 +222,7 @@ def test_a_model_that_kept_no_template_wants_one(work: Path, trained: Path, garm
 
 
 def test_folders_of_stages_that_had_other_names_are_gone_on_with(work: Path, trained: Path):
-    assert run("wrinkles", "maps", work, "--map.size", "64", "--workers", "1") == 0
+    assert run("wrinkles", "maps", work, "--pairs.map.size", "64", "--workers", "1") == 0
     assert run("wrinkles", "apply", trained, work, "--workers", "1") == 0
     before = {}
     for folder, name, former in (
@@ -237,7 +237,7 @@ def test_folders_of_stages_that_had_other_names_are_gone_on_with(work: Path, tra
     frame = work / "wrinkles" / "generated" / "frames" / "000001.png"
     made = frame.stat().st_mtime_ns
     assert run(*train(work, trained)) == 0
-    assert run("wrinkles", "maps", work, "--map.size", "64", "--workers", "1") == 0
+    assert run("wrinkles", "maps", work, "--pairs.map.size", "64", "--workers", "1") == 0
     assert run("wrinkles", "apply", trained, work, "--workers", "1") == 0
     assert frame.stat().st_mtime_ns == made
     for folder, digest in before.items():
@@ -245,7 +245,7 @@ def test_folders_of_stages_that_had_other_names_are_gone_on_with(work: Path, tra
 
 
 def test_a_training_opens_the_maps_of_a_take_once(work: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    assert run("wrinkles", "maps", work, "--map.size", "64", "--workers", "1") == 0
+    assert run("wrinkles", "maps", work, "--pairs.map.size", "64", "--workers", "1") == 0
     opened: list[str] = []
 
     def counting(path: Path) -> Garment:
@@ -413,7 +413,7 @@ def test_damaged_notes_are_named(work: Path, unfinished: Path, capsys: pytest.Ca
     (unfinished / "metrics.jsonl").write_text('{"step": 2}\n{"step"')
     assert "metrics.jsonl: line 2: not valid JSON" in fails(capsys, *train(work, unfinished))
     (work / "registration" / "metrics.jsonl").write_text("[1]\n")
-    line = fails(capsys, "wrinkles", "maps", work, "--map.size", "32", "--overwrite", "--workers", "1")
+    line = fails(capsys, "wrinkles", "maps", work, "--pairs.map.size", "32", "--overwrite", "--workers", "1")
     assert "metrics.jsonl: line 1: expected a JSON object, found list" in line
 
 
@@ -430,7 +430,7 @@ def test_a_checkpoint_that_cannot_be_continued(work: Path, unfinished: Path, cap
 
 
 def test_a_mask_of_another_size(work: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    assert run("wrinkles", "maps", work, "--map.size", "64", "--workers", "1") == 0
+    assert run("wrinkles", "maps", work, "--pairs.map.size", "64", "--workers", "1") == 0
     path = work / "wrinkles" / "pairs" / "high" / "000002.png"
     image = np.zeros((32, 32, 3), np.float32)
     write_bytes(path, encode_png(image, np.ones((32, 32), bool)))
@@ -489,7 +489,7 @@ def test_filling_is_for_display_only(tmp_path: Path, garment: Garment):
     scan, centre = some_scan(), np.array([0.1, 0.25, 0])
     away = np.linalg.norm(scan.vertices[scan.faces].mean(axis=1) - centre, axis=1)
     work = make_work(tmp_path, garment, [submesh(scan, away > 0.04)[0]])
-    assert run("wrinkles", "maps", work, "--map.size", "64", "--workers", "1") == 0
+    assert run("wrinkles", "maps", work, "--pairs.map.size", "64", "--workers", "1") == 0
     high, valid = decode_png((work / "wrinkles" / "pairs" / "high" / "000001.png").read_bytes(), source="high")
     raster = MapTemplate.create(garment, MapConfig(size=64)).raster
     hole = np.linalg.norm(raster.at_vertices(garment.template.vertices.astype(float)) - centre, axis=1) < 0.03

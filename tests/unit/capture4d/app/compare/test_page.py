@@ -110,7 +110,19 @@ def test_a_network_that_has_seen_everything_is_refused(
     assert not (work / "compare").exists()
     shutil.rmtree(work / "wrinkles" / "pairs")  # other pairs of the same registration hide nothing
     with pytest.raises(SystemExit):
-        main(["wrinkles", "maps", str(work), "--map.size", "64", "--projection.blur-texels", "0.3", "--workers", "1"])
+        main(
+            [
+                "wrinkles",
+                "maps",
+                str(work),
+                "--pairs.map.size",
+                "64",
+                "--pairs.projection.blur-texels",
+                "0.3",
+                "--workers",
+                "1",
+            ]
+        )
     assert again(work / "compare", model) == 1
     assert "learned from it without held-out frames" in capsys.readouterr().err
 
@@ -121,7 +133,7 @@ def test_maps_laid_out_otherwise_than_the_network_s_are_refused(
     work = tmp_path / "work"
     shutil.copytree(compared.parent, work, ignore=shutil.ignore_patterns("compare", "pairs"))
     with pytest.raises(SystemExit):
-        main(["wrinkles", "maps", str(work), "--map.size", "64", "--map.padding", "6", "--workers", "1"])
+        main(["wrinkles", "maps", str(work), "--pairs.map.size", "64", "--pairs.map.padding", "6", "--workers", "1"])
     assert again(work / "compare", compared.parents[1] / "model") == 1
     assert "expected maps laid out as" in capsys.readouterr().err
 
@@ -227,7 +239,7 @@ def test_a_model_of_another_template_is_refused(compared: Path):
     ("option", "value", "said"),
     [
         ("--pictures", "0", "at least 1"),
-        ("--gap", "-1", "at least 0"),
+        ("--held-out-gap", "-1", "at least 0"),
         ("--held-out", "0", "above 0, below 1"),
     ],
 )

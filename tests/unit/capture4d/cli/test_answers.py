@@ -1,0 +1,89 @@
+"""What ends a command is a line that says what the same command would do, and an exit code."""
+
+import json
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+from capture4d import pipeline
+from capture4d.cli.answers import TerminatedError
+from capture4d.cli.main import main
+from capture4d.errors import InputError
+from capture4d.runs.run_log import LOG
+from capture4d.runs.stage import StageResult, open_stage
+from capture4d.runs.workers import WorkerDied
+from tests.command_line import run
+
+GOES_ON = "the same command goes on"
+STARTS_OVER = "the same command without --overwrite goes on, with it, it starts over"
+FULL = OSError(28, "No space left on device", "out/x.npz")
+DIED = WorkerDied(
+    "extract: a worker process was killed; finished frames are kept, the same command goes on (with fewer)"
+)
+
+
+@pytest.mark.parametrize(
+    ("error", "code"), [(KeyboardInterrupt(), 130), (TerminatedError(), 143), (FULL, 1), (DIED, 1), (MemoryError(), 1)]
+)
+def test_what_the_same_command_would_do(
+    error: BaseException, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+):
+    def fail(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr(pipeline, "extract", fail)
+    command = ("extract", "take", "--output", tmp_path / "work")
+    for more, said in (((), GOES_ON), (("--overwrite",), STARTS_OVER)):
+        assert run(*command, *more) == code
+        (line,) = capsys.readouterr().err.splitlines()
+        assert said in line
+        assert (STARTS_OVER in line) == bool(more)
+    assert not (tmp_path / "work").exists()
+
+
+@pytest.fixture
+def stopping(monkeypatch: pytest.MonkeyPatch) -> dict[str, BaseException | None]:
+    """An extraction that begins, and then raises what is put here."""
+    fault: dict[str, BaseException | None] = {"raised": None}
+
+    def extract(capture: Path, work: Path, **_: object) -> StageResult:
+        open_stage(work / "garment", name="extract", schema=1, config={}, upstream={})
+        if fault["raised"] is not None:
+            raise fault["raised"]
+        return StageResult(work / "garment", "digest", 3, {6: "no cloth"})
+
+    monkeypatch.setattr(pipeline, "extract", extract)
+    return fault
+
+
+@pytest.mark.parametrize(
+    ("error", "code"), [(None, 0), (InputError("no cloth", where="a.ply"), 1), (KeyboardInterrupt(), 130)]
+)
+def test_the_log_has_what_was_said_and_the_exit_code(
+    error: BaseException | None, code: int, stopping: dict[str, BaseException | None], tmp_path: Path
+):
+    stopping["raised"] = error
+    assert run("extract", "take", "--output", tmp_path / "work") == code
+    lines = [json.loads(line) for line in (tmp_path / "work" / LOG).read_text().splitlines()]
+    events = [line["event"] for line in lines]
+    assert lines[0]["command"] == ["capture4d", "extract", "take", "--output", str(tmp_path / "work")]
+    assert lines[0]["settings"]["learn_colours"] is False
+    assert lines[-1]["code"] == code
+    if error is None:
+        assert events == ["begins", "said", "ends"]
+        assert lines[1]["text"] == "no garment in 1 of 3 frames: 6; frame 6: no cloth"
+    else:
+        assert events == ["begins", "said", "fault", "ends"]
+        assert lines[2]["kind"] == type(error).__name__
+
+
+def test_a_bug_is_in_the_log_and_keeps_its_traceback(stopping: dict[str, BaseException | None], tmp_path: Path):
+    stopping["raised"] = ZeroDivisionError("ours")
+    with pytest.raises(ZeroDivisionError):
+        main(["extract", "take", "--output", str(tmp_path / "work")])
+    *_, fault, ends = [json.loads(line) for line in (tmp_path / "work" / LOG).read_text().splitlines()]
+    assert re.search(r"ZeroDivisionError: ours\n$", fault["traceback"])
+    assert ends["code"] == 1
+    assert type(sys.stderr).__name__ != "_Overheard"
