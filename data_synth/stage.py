@@ -70,13 +70,13 @@ def run(output: Path, config: SynthConfig, *, workers: int = 2, overwrite: bool 
         simulate_clip,
         simulation_jobs(stage, config),
         workers=1,
-        label="Simulating cloth",
+        label="simulate cloth",
         units=lambda _: config.frames,
         finished=lambda: simulated_frames(stage),
     ):
         pass
     prepare = partial(open_scene, stage, config)
-    for _ in run_jobs(scan_frame, scan_jobs(stage, config), prepare=prepare, workers=workers, label="Scanning"):
+    for _ in run_jobs(scan_frame, scan_jobs(stage, config), prepare=prepare, workers=workers, label="scan"):
         pass
     return finish_take(stage, config)
 

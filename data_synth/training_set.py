@@ -55,12 +55,12 @@ def run(output: Path, config: TrainingSetConfig, *, workers: int = 2, overwrite:
     simulations = [job for each in takes.values() for job in simulation_jobs(*each)]
     simulated = [job.stage for job in simulations]
     for _ in run_jobs(
-        simulate_clip, simulations, workers=workers, label="Simulating clips", units=lambda job: job.config.frames,
+        simulate_clip, simulations, workers=workers, label="simulate clips", units=lambda job: job.config.frames,
         finished=lambda: sum(map(simulated_frames, simulated)),
     ):  # fmt: skip
         pass
     scans = [job for each in takes.values() for job in scan_jobs(*each)]
-    for _ in run_jobs(_scan, scans, prepare=_Scenes, workers=workers, label="Scanning"):
+    for _ in run_jobs(_scan, scans, prepare=_Scenes, workers=workers, label="scan"):
         pass
     digests = {name: _finish(output, config, *each).digest for name, each in takes.items()}
     note = {"held_out": config.held_out, "reversed": config.reversed, "bodies": config.bodies, "digests": digests}

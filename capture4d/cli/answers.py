@@ -27,7 +27,7 @@ _DISK_ANSWERS = {
 }
 """What a user's disk can answer; the message names the path, and a traceback would add nothing."""
 _GOES_ON = "the same command goes on"
-_STARTS_OVER = "the same command without --overwrite goes on, with it, it starts over"
+_STARTS_OVER = "the same command goes on without --overwrite, and starts over with it"
 
 
 class TerminatedError(BaseException):

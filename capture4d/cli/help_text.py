@@ -16,7 +16,20 @@ __all__ = ["EXAMPLES", "command_help", "filled", "overview"]
 _WIDEST, _NARROWEST = 100, 40
 _COLUMN = 26
 """Where the sentence about an option begins, counted from the margin."""
-_SHARED = (MeshOptions, ProgressOptions, StageOptions, GradedOptions)
+_SHARED = (StageOptions, GradedOptions, ProgressOptions, MeshOptions, object)
+"""Whose options many commands have, in the order in which they are listed; help is nobody's."""
+_GROUPS: Mapping[str, Sequence[str]] = {
+    "from scans to a registered garment:": (
+        "run", "check", "template", "extract", "track", "register", "report", "status", "diff",
+    ),
+    "learn and animate:": (
+        "fit", "animate", "wrinkles maps", "wrinkles train", "wrinkles apply", "wrinkles offsets", "compare",
+    ),
+    "two meshes:": ("register-mesh",),
+    "rigs:": ("calibrate", "check-rig", "convert-rig", "synth-board"),
+    "captures that nobody filmed:": ("demo", "synth", "scan"),
+    "files and this installation:": ("convert-body", "convert-poses", "doctor"),
+}  # fmt: skip
 
 EXAMPLES: Mapping[str, Sequence[str]] = {
     "demo": ("demo --output out",),
@@ -86,17 +99,21 @@ def command_help(name: str, kind: type, options: Sequence[Option], *, experts: b
 
 def overview(commands: Mapping[str, type], group: str = "") -> str:
     """What there is to run, a line a command: of all, or of those whose name begins with `group`."""
-    shown = {name: command for name, command in commands.items() if name.startswith(group)}
+    left = {name: command for name, command in commands.items() if name.startswith(group)}
     lines = [
         "usage: capture4d COMMAND ...",
         "",
         *_wrapped("4D garment capture: registration of coloured scans, learned garments, and a synthetic 4D scanner."),
         "",
     ]
-    for name, command in shown.items():
-        lines += _row(name, summary_of(command), column=20)
+    for title, names in {**_GROUPS, "more:": tuple(left)}.items():
+        rows = {name: left.pop(name) for name in names if name in left}
+        if rows:
+            lines.append(title)
+        for name, command in rows.items():
+            lines += _row(name, f"{summary_of(command).partition('. ')[0].rstrip('.')}.", column=20)
+        lines += [""] * bool(rows)
     lines += [
-        "",
         *_wrapped(
             "capture4d COMMAND --help lists a command's options, capture4d help TOPIC explains; capture4d help lists "
             "the topics. Every command resumes where it was stopped."
@@ -115,24 +132,22 @@ def _in_usage(option: Option) -> str:
     return word if option.is_required else f"[{word}]"
 
 
-def _groups(options: Iterable[Option]) -> Iterator[tuple[str, list[Option]]]:
+def _groups(options: Sequence[Option]) -> Iterator[tuple[str, list[Option]]]:
     """Options with a heading: the command's own, those of settings, those that many commands share."""
 
-    def place(option: Option) -> tuple[int, str, str]:
-        if option.owner in _SHARED:
-            return 2, "", ""
-        prefix = option.spelling[2:].rpartition(".")[0]
-        return (0, "", "") if option.depth == 0 else (1, prefix, option.owner.__qualname__)
+    own = [option for option in options if option.depth == 0 and option.owner not in _SHARED]
+    if own:
+        yield "options:", sorted(own, key=lambda option: not option.is_required)
+    settings = (option for option in options if option.depth > 0)
+    for (prefix, owner), group in groupby(settings, key=lambda option: (_prefix(option), option.owner)):
+        yield f"{prefix or 'settings'}: {summary_of(owner)}", list(group)
+    shared = [option for owner in _SHARED for option in options if option.owner is owner]
+    if shared:
+        yield "how it runs:", shared
 
-    ordered = sorted(options, key=lambda option: place(option)[0])  # stable: else as they are declared
-    for (rank, prefix, _), found in groupby(ordered, key=place):
-        group = list(found)
-        if rank == 1:
-            yield f"{prefix or 'settings'}: {summary_of(group[0].owner)}", group
-        elif rank == 0:
-            yield "options:", sorted(group, key=lambda option: not option.is_required)
-        else:
-            yield "how it runs:", group
+
+def _prefix(option: Option) -> str:
+    return option.spelling[2:].rpartition(".")[0]
 
 
 def _rows(options: Iterable[Option]) -> list[str]:
@@ -153,13 +168,13 @@ def _shown(option: Option) -> str:
     if option.is_positional:
         return option.spelling
     if option.kind is bool:
-        return option.negation if option.default is True else option.spelling
+        return f"{option.spelling}, {option.negation}" if option.default is True else option.spelling
     return f"{option.spelling} {option.metavar}"
 
 
 def _said(option: Option) -> str:
     if option.kind is bool and option.default is True:
-        return f"{option.text} On by default; this turns it off."
+        return f"{option.text} (default: {option.spelling})"
     if option.is_required:
         return f"{option.text} (required)"
     shown = _value(option.default)
@@ -198,6 +213,6 @@ _HELP = Option(
     metavar="",
     default=False,
     text="Print this. --help-all tells of every setting.",
-    owner=StageOptions,
+    owner=object,
     depth=0,
 )

@@ -76,7 +76,7 @@ def write_fixed(checked: Checked, output: Path | None = None, *, workers: int = 
         shutil.rmtree(partial)
     (partial / "scans").mkdir(parents=True)
     jobs = [_Job(n, take.files[n], partial / "scans" / f"{n:06d}.ply", placement) for n in kept]
-    written = sorted(number for number in run_jobs(_rewrite, jobs, workers=workers, label="Correcting") if number >= 0)
+    written = sorted(number for number in run_jobs(_rewrite, jobs, workers=workers, label="correct") if number >= 0)
     _copy_companions(checked, partial)
     write_json(partial / "capture.json", _description(checked, written, partial))
     partial.rename(output)

@@ -164,7 +164,9 @@ def _lines(say: Callable[[_Told], None], count: _Count) -> Iterator[None]:
 
     def keep_telling() -> None:
         while not stop.wait(EVERY_S):
-            say(count.told("running"))
+            told = count.told("running")
+            if told.done != told.total:  # the end is told once, when processes have ended, too
+                say(told)
 
     say(count.told("running"))
     teller = threading.Thread(target=keep_telling, daemon=True)

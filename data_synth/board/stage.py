@@ -63,7 +63,7 @@ def run(rig_path: Path, images: Path, config: BoardConfig, *, workers: int = 1, 
         for pose, T_world_board in enumerate(poses)
     ]
     lost = [job for job in jobs if not all(job.path(camera).is_file() for camera in job.cameras)]
-    for _ in run_jobs(_photograph, lost, workers=workers, label="Photographing"):
+    for _ in run_jobs(_photograph, lost, workers=workers, label="photograph"):
         pass
     return stage.finish((job.path(camera) for job in jobs for camera in job.cameras), changed=bool(lost))
 
