@@ -9,7 +9,7 @@ import pytest
 
 from capture4d.cli.main import main
 
-PROGRESS = re.compile(r"[\w -]+(, [\w -]+)?: (begins|(stopped|ends) after [\d:]+|\d+ of \d+(, | in ).*)")
+PROGRESS = re.compile(r"[\w ,-]+: (begins|(stopped|ends) after [\d:]+|\d+ of \d+(, | in ).*)")
 """A line about how far the work is, where stderr is not a terminal."""
 
 

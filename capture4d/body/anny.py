@@ -26,6 +26,7 @@ from capture4d.cache import user_cache_folder
 from capture4d.files.records import load_body, save_body
 from capture4d.geometry.mesh import connected_components, face_areas
 from capture4d.heavy_imports import import_anny
+from capture4d.runs.progress import progress
 from capture4d.types import Body, Mesh
 
 __all__ = ["load_anny"]
@@ -38,11 +39,11 @@ HEAD_JOINTS, HAND_JOINTS, FOOT_JOINTS = ("head", "neck02", "neck03"), ("wrist.",
 
 
 def load_anny() -> Body:
-    """The parametric body, from the user's cache; baked there first, with a message, on a fresh machine."""
+    """The parametric body, from the user's cache; baked there first, which is told as progress, on a fresh machine."""
     path = user_cache_folder() / f"body-anny-v{BAKE_VERSION}.npz"
     if not path.exists():
-        print(f"Baking the parametric body once into {path} (about a minute)", flush=True)
-        with tempfile.TemporaryDirectory(prefix="capture4d-anny-") as scratch:
+        label = "bake the parametric body, once, in about a minute"
+        with progress(label, 1), tempfile.TemporaryDirectory(prefix="capture4d-anny-") as scratch:
             save_body(path, _bake(Path(scratch)))
     return load_body(path)
 

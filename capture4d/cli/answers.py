@@ -26,8 +26,9 @@ _DISK_ANSWERS = {
     errno.EROFS,
 }
 """What a user's disk can answer; the message names the path, and a traceback would add nothing."""
+_KEPT = "finished frames are kept, "
 _GOES_ON = "the same command goes on"
-_STARTS_OVER = "the same command goes on without --overwrite, and starts over with it"
+_BEGINS_ANEW = "without --overwrite the same command goes on, with it it begins anew"
 
 
 class TerminatedError(BaseException):
@@ -49,7 +50,9 @@ def answer_to(error: BaseException, arguments: Sequence[str]) -> int | None:
     if answer is None:
         return None
     said, code = answer
-    return complain(said.replace(_GOES_ON, _STARTS_OVER) if "--overwrite" in arguments else said, code=code)
+    if "--overwrite" in arguments:
+        said = said.replace(f"kept, {_GOES_ON}", f"kept; {_GOES_ON}").replace(_GOES_ON, _BEGINS_ANEW)
+    return complain(said, code=code)
 
 
 def _said(error: BaseException) -> tuple[str, int] | None:
@@ -58,16 +61,16 @@ def _said(error: BaseException) -> tuple[str, int] | None:
     if isinstance(error, InputError):
         return str(error), BAD_INPUT
     if isinstance(error, KeyboardInterrupt):
-        return f"interrupted; finished frames are kept, {_GOES_ON}", INTERRUPTED
+        return f"interrupted; {_KEPT}{_GOES_ON}", INTERRUPTED
     if isinstance(error, TerminatedError):
-        return f"terminated; finished frames are kept, {_GOES_ON}", TERMINATED
+        return f"terminated; {_KEPT}{_GOES_ON}", TERMINATED
     out_of_memory = memory_fault(error)
     if out_of_memory is not None:
         return out_of_memory, BAD_INPUT
     if isinstance(error, OSError):
         if error.errno not in _DISK_ANSWERS or (error.filename is None and error.errno != errno.ENOSPC):
             return None
-        kept = f"; finished frames are kept, {_GOES_ON}" if error.errno == errno.ENOSPC else ""
+        kept = f"; {_KEPT}{_GOES_ON}" if error.errno == errno.ENOSPC else ""
         return f"{error.filename or 'output'}: {error.strerror}{kept}", BAD_INPUT
     if isinstance(error, RuntimeError):
         from capture4d.runs.workers import WorkerDied

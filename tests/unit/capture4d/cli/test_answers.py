@@ -17,7 +17,7 @@ from capture4d.runs.workers import WorkerDied
 from tests.command_line import run
 
 GOES_ON = "the same command goes on"
-STARTS_OVER = "the same command goes on without --overwrite, and starts over with it"
+BEGINS_ANEW = "without --overwrite the same command goes on, with it it begins anew"
 FULL = OSError(28, "No space left on device", "out/x.npz")
 DIED = WorkerDied(
     "extract: a worker process was killed; finished frames are kept, the same command goes on (with fewer)"
@@ -35,7 +35,7 @@ def test_what_the_same_command_would_do(
 
     monkeypatch.setattr(pipeline, "extract", fail)
     command = ("extract", "take", "--output", tmp_path / "work")
-    for more, said in (((), GOES_ON), (("--overwrite",), STARTS_OVER)):
+    for more, said in (((), GOES_ON), (("--overwrite",), BEGINS_ANEW)):
         assert run(*command, *more) == code
         (line,) = capsys.readouterr().err.splitlines()
         assert said in line

@@ -85,6 +85,15 @@ def test_examples_are_understood(name: str):
         parse(name, COMMANDS[name], rest, _PRESETS.get(COMMANDS[name]))
 
 
+QUICK = {"template", "register-mesh", "convert-body", "convert-rig", "convert-poses", "doctor", "status", "diff"}
+"""Commands that show no progress."""
+
+
+@pytest.mark.parametrize("name", sorted({*COMMANDS} - QUICK))
+def test_whatever_shows_progress_can_be_quiet_or_speak_json(name: str):
+    assert {"--quiet", "--json-progress"} <= {option.spelling for option in options_of(COMMANDS[name])}
+
+
 def test_defaults_are_those_of_the_preset(capsys: pytest.CaptureFixture[str]):
     nodes = re.compile(r"--registration.graph.nodes N\s.*?\(default:\s+(\d+)\)", re.DOTALL)
     found = {
