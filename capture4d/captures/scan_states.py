@@ -14,11 +14,20 @@ from dataclasses import replace
 from pathlib import Path
 
 from capture4d.captures.capture import Capture, scan_path
-from capture4d.errors import InputError
+from capture4d.errors import InputError, StaleError
 from capture4d.files.reading import companions_named
 from capture4d.runs.made import FileState, Ledger, digest_of, file_state, is_as
+from capture4d.runs.stage import read_record
 
-__all__ = ["DAMAGED", "as_it_is_now", "replaced_scan", "scan_digest", "scan_looked_at", "stands_with_scan"]
+__all__ = [
+    "DAMAGED",
+    "as_it_is_now",
+    "replaced_scan",
+    "require_same_take",
+    "scan_digest",
+    "scan_looked_at",
+    "stands_with_scan",
+]
 
 DAMAGED = "damaged"
 """What is said of a file whose scan could not be read: that is tried again in every run, in case it was repaired."""
@@ -80,6 +89,27 @@ def replaced_scan(ledger: Ledger, path: Path, capture: Capture, frame_id: int) -
     made = ledger.of(path)
     files = () if made is None else as_it_is_now(capture, frame_id, made.files)
     return made is not None and bool(files) and scan_digest(files) != made.inputs.get("scan")
+
+
+def require_same_take(folder: Path, capture: Capture) -> None:
+    """See that a stage's folder is not that of another take: one that lies elsewhere and has no scan in common.
+
+    Raises:
+        StaleError: it is. A take may be given by a wrong name, and what a stage has made is not lost to that.
+    """
+    record = read_record(folder / "stage.json") if (folder / "stage.json").is_file() else {}
+    place = record.get("sources", {}).get("capture")
+    if record.get("status") == "discarded" or place is None or Path(place) == capture.path.resolve():
+        return
+    ledger = Ledger.read(folder)
+    paths = {each: folder / "frames" / f"{each:06d}.npz" for each in capture.frame_ids}
+    known = [each for each, path in paths.items() if ledger.of(path) is not None]
+    if known and all(replaced_scan(ledger, paths[each], capture, each) for each in known):
+        raise StaleError(
+            f"was made from another take, {place}: none of its scans is the same; give another --output, or "
+            "--overwrite",
+            where=folder,
+        )
 
 
 def _name(path: Path, folder: Path) -> str:

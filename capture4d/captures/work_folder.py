@@ -200,7 +200,7 @@ def require_from_scans(folder: Path, name: str, command: str, capture: Capture) 
     paths = {frame_id: folder / "frames" / f"{frame_id:06d}.npz" for frame_id in {*capture.frame_ids} & {*made_for}}
     replaced = sorted(each for each, path in paths.items() if replaced_scan(ledger, path, capture, each))
     if replaced:
-        words.append(f"{counted(replaced)} replaced")
+        words.append(counted(replaced, "replaced"))
     if words:
         raise StaleError(f"'{name}' is of the take as it was before ({', '.join(words)}); run: {command}", where=folder)
     return record["digest"], ledger

@@ -19,7 +19,14 @@ import numpy as np
 
 from capture4d.captures.capture import Capture, read_frame, scan_path
 from capture4d.captures.garment_scans import ESTIMATED, save_garment_scan
-from capture4d.captures.scan_states import DAMAGED, replaced_scan, scan_digest, scan_looked_at, stands_with_scan
+from capture4d.captures.scan_states import (
+    DAMAGED,
+    replaced_scan,
+    require_same_take,
+    scan_digest,
+    scan_looked_at,
+    stands_with_scan,
+)
 from capture4d.captures.take_colours import (
     COLOURS,
     KnownColours,
@@ -74,6 +81,8 @@ def run(
         InputError: a scan is missing, none can be read, or the first that can lack the garment's colours; or these are
             to be learned and are not separable.
     """
+    if not overwrite:
+        require_same_take(output, capture)
     stage = open_growing_stage(
         output,
         name=NAME,
@@ -87,7 +96,7 @@ def run(
     inputs = _inputs(capture, taken.colours)
     pending = _pending(capture, stage.ledger, inputs)
     if pending.replaced:
-        say(f"{output.name}: {counted(pending.replaced)} replaced")
+        say(f"{output.name}: {counted(pending.replaced, 'replaced')}")
     if pending.frames:
         if taken.frames and not taken.newly and taken.frames != listed(capture.frame_ids, most=0):
             say(f"{output.name}: the colours are kept as frames {taken.frames} gave them; "

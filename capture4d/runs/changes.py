@@ -93,9 +93,9 @@ def description_changes(now: Mapping[str, Any], before: Mapping[str, Any]) -> li
     """What differs in what a stage read of capture.json."""
     words = []
     for key in now:
-        new, old = now[key], before.get(key)
-        if new == old:
+        if key not in before or now[key] == before[key]:
             continue
+        new, old = now[key], before[key]
         if key == "boundary_colours" and isinstance(new, Mapping) and isinstance(old, Mapping):
             words += _border_changes(new, old)
         else:
@@ -131,8 +131,8 @@ def input_changes(now: Mapping[str, str], before: Mapping[str, str]) -> list[str
 def frame_changes(now: Sequence[int], before: Sequence[int]) -> list[str]:
     """Frames that came and went."""
     added, removed = sorted(set(now) - set(before)), sorted(set(before) - set(now))
-    words = [f"{counted(added)} added"] if added else []
-    return words + ([f"{counted(removed)} removed"] if removed else [])
+    words = [counted(added, "added")] if added else []
+    return words + ([counted(removed, "removed")] if removed else [])
 
 
 def _shown(value: Any) -> str:

@@ -65,9 +65,11 @@ def listed(frame_ids: Iterable[int], most: int = 8) -> str:
     return ",".join(shown)
 
 
-def counted(frame_ids: Sequence[int], what: str = "frame") -> str:
-    """How many, and which: `frame 12`, `5 frames (201-205)`."""
-    return f"{what} {frame_ids[0]}" if len(frame_ids) == 1 else f"{len(frame_ids)} {what}s ({listed(frame_ids)})"
+def counted(frame_ids: Sequence[int], what: str) -> str:
+    """What happened to how many, and which: `frame 12 added`, `5 frames added (201-205)`."""
+    if len(frame_ids) == 1:
+        return f"frame {frame_ids[0]} {what}"
+    return f"{len(frame_ids)} frames {what} ({listed(frame_ids)})"
 
 
 def _runs(frame_ids: Sequence[int]) -> list[str]:

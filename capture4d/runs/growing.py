@@ -150,7 +150,7 @@ def open_growing_stage(
         "frames": listed(reads.frame_ids, most=0),
     }
     stage = opened_record(folder, kept, existing, sources, kind=partial(GrowingStage, ledger=Ledger.open(folder)))
-    _drop_frames(folder, {*reads.frame_ids, *reads.left_out})
+    _drop_frames(stage, {*reads.frame_ids, *reads.left_out})
     return stage
 
 
@@ -180,7 +180,7 @@ def stage_changes(
     found = Pending(reads.frame_ids) if changed else pending(Ledger.read(folder))
     words = _changed_inputs(reads, existing)
     if found.replaced:
-        words.append(f"{counted(found.replaced)} replaced")
+        words.append(counted(found.replaced, "replaced"))
     complete = existing.get("status") == "complete"
     current = complete and not (changed or words or found.frames)
     return StageChanges(
@@ -210,10 +210,15 @@ def frames_of(record: Mapping[str, Any]) -> tuple[int, ...] | None:
     return expanded(text) if isinstance(text, str) else None
 
 
-def _drop_frames(folder: Path, kept: set[int]) -> None:
+def _drop_frames(stage: GrowingStage, kept: set[int]) -> None:
     """Delete the files of frames that the take no longer has."""
-    for each in folder.iterdir():
+
+    def stays(path: Path) -> bool:
+        return not path.stem.isdecimal() or int(path.stem) in kept
+
+    for each in stage.path.iterdir():
         if each.is_dir() and not each.is_symlink():
             for path in each.iterdir():
-                if path.stem.isdecimal() and int(path.stem) not in kept:
+                if not stays(path):
                     path.unlink(missing_ok=True)
+    stage.ledger.forget(stays)

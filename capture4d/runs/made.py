@@ -114,9 +114,6 @@ class Ledger:
         """Know no longer of files that are not to be kept."""
         self._made = {place: made for place, made in self._made.items() if keep(self.folder / place)}
 
-    def places(self) -> Iterator[Path]:
-        return (self.folder / place for place in self._made)
-
     def settle(self) -> None:
         """Write what is known into one file; the notes that it was known from go."""
         lines = (_line(place, made) for place, made in self._made.items())

@@ -174,7 +174,7 @@ def open_stage(
         changed = input_changes(settings["upstream"], existing.get("upstream", {}))
         if changed:
             raise StaleError(
-                f"was made from other inputs ({', '.join(changed[:3])}); the same command with --overwrite makes it "
+                f"was made from other inputs ({', '.join(changed[:3])}); with --overwrite the same command makes it "
                 "from those that are there now",
                 where=folder,
             )
@@ -220,16 +220,16 @@ def unchanged_settings(settings: Mapping[str, Any], existing: Mapping[str, Any],
     """Raises StaleError where a stage's folder was made with other settings, or in another format."""
     if existing.get("schema") != settings["schema"]:
         raise StaleError(
-            f"was made by an earlier version of capture4d, in format {existing.get('schema')}; the same command with "
-            "--overwrite makes it anew",
+            f"was made by an earlier version of capture4d, in format {existing.get('schema')}; with --overwrite the "
+            "same command makes it anew",
             where=folder,
         )
     changed = setting_changes(settings["config"], existing.get("config") or {})
     if changed:
         more = f" and {len(changed) - 3} more" if len(changed) > 3 else ""
         raise StaleError(
-            f"was made with other settings ({', '.join(changed[:3])}{more}); the same command with --overwrite makes "
-            "it anew, and what hangs on it, and keeps what it is made from",
+            f"was made with other settings ({', '.join(changed[:3])}{more}); with --overwrite the same command makes "
+            "it anew, and keeps what it is made from",
             where=folder,
         )
 

@@ -27,11 +27,11 @@ from capture4d.tracking.config import TrackingConfig
 from capture4d.tracking.sequence import NOTHING, Followed, Tracker
 from capture4d.tracking.take import TrackedTake, followed_frame, load_followed, numbers_of
 
-__all__ = ["follow_frames", "require_found", "standing_frames"]
+__all__ = ["Chain", "follow_frames", "require_found", "standing_frames"]
 
 
 @dataclass(frozen=True, slots=True)
-class _Chain:
+class Chain:
     """Where the next frame starts from: the last frame, and the one before that if the motion can be told."""
 
     last: tuple[Path, Made] | None = None
@@ -42,11 +42,11 @@ class _Chain:
         last, before = ("" if each is None else each[1].digest for each in (self.last, self.before))
         return {"settings": settings, "last": last, "before": before, **({} if last else {"frame": str(frame_id)})}
 
-    def followed_by(self, path: Path, made: Made) -> _Chain:
+    def followed_by(self, path: Path, made: Made) -> Chain:
         if made.said["nothing"]:
             return self
         steady = self.last is not None and not made.said["lost_frames"] and not self.last[1].said["lost_frames"]
-        return _Chain((path, made), self.last if steady else None)
+        return Chain((path, made), self.last if steady else None)
 
 
 def follow_frames(take: TrackedTake) -> None:
@@ -57,7 +57,7 @@ def follow_frames(take: TrackedTake) -> None:
         return
     replaced = [each for each in frame_ids if replaced_scan(ledger, take.stage.frame_path(each), take.capture, each)]
     if replaced:
-        say(f"{take.stage.path.name}: {counted(replaced)} replaced")
+        say(f"{take.stage.path.name}: {counted(replaced, 'replaced')}")
     tracker = take.tracker()
     with progress("track body", len(frame_ids), completed=at) as advance:
         for frame_id in frame_ids[at:]:
@@ -70,9 +70,9 @@ def follow_frames(take: TrackedTake) -> None:
             advance(1)
 
 
-def standing_frames(take: TrackedTake, settings: str) -> tuple[_Chain, int]:
+def standing_frames(take: TrackedTake, settings: str) -> tuple[Chain, int]:
     """How many of the first frames stand, and where the next would start from."""
-    chain = _Chain()
+    chain = Chain()
     for at, frame_id in enumerate(take.capture.frame_ids):
         path, ledger = take.stage.frame_path(frame_id), take.stage.ledger
         if not stands_with_scan(ledger, path, take.capture, frame_id, chain.inputs(settings, frame_id)):
@@ -83,7 +83,7 @@ def standing_frames(take: TrackedTake, settings: str) -> tuple[_Chain, int]:
     return chain, len(take.capture.frame_ids)
 
 
-def _follow_frame(take: TrackedTake, tracker: Tracker, frame_id: int, chain: _Chain, inputs: Mapping[str, str]) -> None:
+def _follow_frame(take: TrackedTake, tracker: Tracker, frame_id: int, chain: Chain, inputs: Mapping[str, str]) -> None:
     begin = time.process_time()
     points, fault, looked = take.points(frame_id)
     last, before = (None if each is None else load_followed(each[0]) for each in (chain.last, chain.before))

@@ -26,7 +26,7 @@ import numpy as np
 
 from capture4d.body.anny import load_anny
 from capture4d.captures.capture import Capture
-from capture4d.captures.scan_states import replaced_scan
+from capture4d.captures.scan_states import replaced_scan, require_same_take
 from capture4d.captures.take_colours import colours_of_take, kept_colours, take_colours
 from capture4d.files.arrays import ArrayFile
 from capture4d.files.atomic import read_json, read_json_lines, write_json_lines
@@ -64,6 +64,8 @@ def run(
     Raises:
         InputError: the capture is damaged, none of its scans can be read, or the start is no pose of its body.
     """
+    if not overwrite:
+        require_same_take(output, capture)
     stage = open_growing_stage(
         output,
         name=NAME,

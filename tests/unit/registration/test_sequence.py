@@ -10,7 +10,7 @@ from capture4d.body.skinning import pose_frame, skin
 from capture4d.errors import InputError
 from capture4d.types import Body, Garment, Mesh, PoseSequence
 from registration.config import SequenceConfig
-from registration.predictions import Mover, blend, choose, misfit, predict
+from registration.predictions import Mover, bend_deg, blend, choose, misfit, predict
 from registration.register import prepare_frame
 from registration.sequence import register_run, segments
 from registration.template import analyse_template
