@@ -28,6 +28,7 @@ from wrinkles.normal_maps.config import ApplyConfig, PairConfig, WrinkleConfig
 from wrinkles.offset_images.config import OffsetConfig
 
 if TYPE_CHECKING:
+    from capture4d.app.differences.work_diff import WorkDiff
     from capture4d.calibration.check import CameraCheck
     from capture4d.calibration.stage import CalibrationResult
     from capture4d.preflight.check import Checked
@@ -37,27 +38,10 @@ if TYPE_CHECKING:
     from retarget.animation.stage import Wearer
 
 __all__ = [
-    "animate",
-    "calibrate",
-    "check",
-    "check_rig",
-    "compare",
-    "extract",
-    "fit",
-    "register",
-    "register_mesh",
-    "report",
-    "run",
-    "scan",
-    "synth",
-    "synth_board",
-    "template",
-    "track",
-    "wrinkles_apply",
-    "wrinkles_maps",
-    "wrinkles_offsets",
-    "wrinkles_train",
-]
+    "animate", "calibrate", "check", "check_rig", "compare", "diff", "extract", "fit", "register", "register_mesh",
+    "report", "run", "scan", "synth", "synth_board", "template", "track", "wrinkles_apply", "wrinkles_maps",
+    "wrinkles_offsets", "wrinkles_train",
+]  # fmt: skip
 
 Place: TypeAlias = str | Path
 AnyCapture: TypeAlias = Capture | Place
@@ -429,6 +413,23 @@ def compare(
 
     learned, config = _maybe(garment_model), config or CompareConfig()
     return stage(_work(work), Path(model), config, garment_model=learned, workers=workers, overwrite=overwrite)
+
+
+def diff(first: AnyWork, second: AnyWork, page: Place | None = None, *, overwrite: bool = False) -> WorkDiff:
+    """Compare two work folders, finished or not: settings, metrics, and frames by their numbers.
+
+    Args:
+        first: what there was; `second`, what it has become.
+        page: HTML file to write, with the curves of both.
+        overwrite: write it over a file that is something else.
+    """
+    from capture4d.app.differences.page import write_page
+    from capture4d.app.differences.work_diff import diff_works
+
+    found = diff_works(_work(first), _work(second))
+    if page is not None:
+        write_page(found, Path(page), overwrite=overwrite)
+    return found
 
 
 def _capture(capture: AnyCapture) -> Capture:

@@ -1,5 +1,6 @@
 """The report of a work folder: WORK/report/index.html, self-contained, and WORK/report/metrics.json.
 
+frames.jsonl beside them keeps what is measured here of each frame, against the truth, if there is one.
 docs/reference/report.md defines every metric. Those against truth appear where the capture has one.
 """
 
@@ -22,7 +23,7 @@ import numpy as np
 from capture4d.app.drawing.charts import Line, line_chart
 from capture4d.app.drawing.palette import BLUE, GREEN, GREY, ORANGE
 from capture4d.app.drawing.panels import Framing, Panel, colour_bar, draw_frame, readable_scan
-from capture4d.app.report.metrics import METRICS, column, shown, summarise, truth_measures
+from capture4d.app.report.metrics import METRICS, column, own_measures, shown, summarise, truth_measures
 from capture4d.app.report.stages import (
     Calibration,
     Comparison,
@@ -39,7 +40,7 @@ from capture4d.captures.evaluation import correspondence_errors, material_points
 from capture4d.captures.truth import TruthModel, read_truth_model, read_truth_vertices
 from capture4d.captures.work_folder import VERDICTS, WorkFolder
 from capture4d.errors import InputError
-from capture4d.files.atomic import write_bytes, write_json
+from capture4d.files.atomic import write_bytes, write_json, write_json_lines
 from capture4d.runs.stage import StageResult, open_stage, read_record, require_complete, result_of
 from capture4d.runs.workers import run_jobs, shared
 from capture4d.settings import Count, settings
@@ -159,6 +160,8 @@ def run(
             "frames": len(records),
         },
     )
+    joints = () if tracked is None else tracked.records
+    write_json_lines(folder / "frames.jsonl", own_measures(records, work.records, joints))
     page = _page(scene, records, summary, scales, rows, stages)
     write_bytes(folder / "index.html", page.encode())
     # the report holds times, which differ between equal runs; nothing is made from it
