@@ -188,15 +188,9 @@ def calibrate(
     from capture4d.calibration.stage import run as stage
 
     result = stage(
-        Path(images),
-        Path(output),
-        board,
-        config or CalibrationConfig(),
-        pattern=pattern,
-        colmap=_maybe(colmap),
-        workers=workers,
-        overwrite=overwrite,
-    )
+        Path(images), Path(output), board, config or CalibrationConfig(),
+        pattern=pattern, colmap=_maybe(colmap), workers=workers, overwrite=overwrite,
+    )  # fmt: skip
     write_page(Path(output).with_name("calibration.html"), result.report)
     return result
 
@@ -248,6 +242,7 @@ def template(
     *,
     body: Place | None = None,
     poses: Place | None = None,
+    overwrite: bool = False,
 ) -> TemplateResult:
     """Make a template of a garment mesh, or of a part of the body: bound, its borders named, its UVs checked.
 
@@ -255,20 +250,24 @@ def template(
         mesh: garment that lies on the body; None where `config` names a region of the body.
         body: the body it lies on, a body.npz; the built-in one if None.
         poses: motion file with the pose and the shape in which it lies there; the rest pose if None.
+        overwrite: write it over a file that holds something else.
     """
+    from capture4d.files.outputs import new_files
     from capture4d.templates.stage import run as stage
 
-    return stage(
-        None if mesh is None else Path(mesh),
-        Path(output),
-        config or TemplateConfig(),
-        body=None if body is None else Path(body),
-        poses=None if poses is None else Path(poses),
-    )
+    given, place, config = [_maybe(path) for path in (mesh, body, poses)], Path(output), config or TemplateConfig()
+    with new_files([place], inputs=given, overwrite=overwrite) as workshop:
+        result = stage(given[0], workshop / place.name, config, body=given[1], poses=given[2])
+    return replace(result, path=place)
 
 
 def register_mesh(
-    template: Place, scan: Place, output: Place, config: MeshRegistrationConfig | None = None
+    template: Place,
+    scan: Place,
+    output: Place,
+    config: MeshRegistrationConfig | None = None,
+    *,
+    overwrite: bool = False,
 ) -> MeshRegistration:
     """Register one mesh file to another; writes the result, and its measures as JSON beside it.
 
@@ -277,8 +276,8 @@ def register_mesh(
     from capture4d.extraction.garment import painted_border
     from registration.register_mesh import run as stage
 
-    config = config or MeshRegistrationConfig()
-    return stage(Path(template), Path(scan), Path(output), config, find_border=painted_border)
+    given, config = (Path(template), Path(scan), Path(output)), config or MeshRegistrationConfig()
+    return stage(*given, config, find_border=painted_border, overwrite=overwrite)
 
 
 def fit(

@@ -13,7 +13,7 @@ from pathlib import Path
 from capture4d.errors import InputError
 from capture4d.files.atomic import TEMPORARY_SUFFIX
 
-__all__ = ["new_files", "new_files_in", "require_apart"]
+__all__ = ["new_files", "new_files_in", "require_apart", "require_free"]
 
 
 def require_apart(outputs: Iterable[Path], inputs: Iterable[Path | None]) -> None:
@@ -29,6 +29,12 @@ def require_apart(outputs: Iterable[Path], inputs: Iterable[Path | None]) -> Non
         for source in sources:
             if _is_same(output, source):
                 raise InputError(f"expected a file to write to, found the input {source}", where=output)
+
+
+def require_free(place: Path, made: Path) -> None:
+    """Raises InputError where something else is than the file that was made for the place."""
+    if os.path.lexists(place) and not _hold_the_same(made, place):
+        raise InputError("expected no file yet, or this very result; found another; use --overwrite", where=place)
 
 
 @contextlib.contextmanager
@@ -84,9 +90,9 @@ def _put_in_place(workshop: Path, folder: Path, inputs: Sequence[Path | None], o
     places = {path: folder / path.name for path in sorted(workshop.iterdir()) if path.is_file()}
     require_apart(places.values(), inputs)
     changed = {path: place for path, place in places.items() if not _hold_the_same(path, place)}
-    for place in changed.values():
-        if os.path.lexists(place) and not overwrite:
-            raise InputError("expected no file yet, or this very result; found another; use --overwrite", where=place)
+    if not overwrite:
+        for path, place in changed.items():
+            require_free(place, path)
     for path, place in changed.items():
         os.replace(path, place)
 
