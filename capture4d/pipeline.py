@@ -8,7 +8,7 @@ from under `if __name__ == "__main__":`, for its processes import it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
@@ -17,6 +17,8 @@ from capture4d.app.compare.config import CompareConfig
 from capture4d.calibration.config import CalibrationConfig, RigCheckConfig
 from capture4d.captures.capture import Capture, read_capture
 from capture4d.captures.work_folder import WorkFolder, open_work
+from capture4d.runs.changes import StageChanges
+from capture4d.runs.decisions import forget_decisions, take_over_decisions
 from capture4d.runs.stage import StageResult
 from capture4d.synthetic import scan, synth, synth_board
 from capture4d.templates.config import TemplateConfig
@@ -49,7 +51,12 @@ AnyWork: TypeAlias = WorkFolder | Place
 
 
 def extract(
-    capture: AnyCapture, work: AnyWork, *, learn_colours: bool = False, workers: int = 1, overwrite: bool = False
+    capture: AnyCapture,
+    work: AnyWork,
+    *,
+    learn_colours: bool = False,
+    workers: int = 1,
+    overwrite: bool = False,
 ) -> StageResult:
     """Cut the garment out of every scan by its colour, and find its painted borders: WORK/garment.
 
@@ -59,8 +66,13 @@ def extract(
     from capture4d.extraction.stage import ExtractionSettings
     from capture4d.extraction.stage import run as stage
 
-    config = ExtractionSettings(learn_colours=learn_colours)
-    return stage(_capture(capture), _path(work) / "garment", config, workers=workers, overwrite=overwrite)
+    return stage(
+        _capture(capture),
+        _path(work) / "garment",
+        ExtractionSettings(learn_colours=learn_colours),
+        workers=workers,
+        overwrite=overwrite,
+    )
 
 
 def track(
@@ -75,7 +87,11 @@ def track(
     from capture4d.tracking.stage import run as stage
 
     return stage(
-        _capture(capture), _path(work) / "body", config or TrackingConfig(), workers=workers, overwrite=overwrite
+        _capture(capture),
+        _path(work) / "body",
+        config or TrackingConfig(),
+        workers=workers,
+        overwrite=overwrite,
     )
 
 
@@ -143,21 +159,81 @@ def run(
         tracking: settings of `track`.
         tracked: track the body even if the capture brings poses.
         draw: False leaves the report out.
+        overwrite: begin anew with the first stage whose settings are others than before, and keep what it is made from;
+            with the first of all if none are.
     Returns:
         The registration's result; its path is the page of the report, if that was drawn.
     """
-    opened = _capture(capture)
+    opened, folder = _capture(capture), _path(work)
     tracked = tracked or _needs_tracking(opened)
     if not tracked:
         _ = opened.poses  # what is wrong with it is said before the work, not after
-    extract(opened, work, workers=workers, overwrite=overwrite)
+    anew = _made_anew(changes(opened, folder, config, tracking=tracking, tracked=tracked)) if overwrite else ()
+    extract(opened, folder, workers=workers, overwrite="extract" in anew)
     if tracked:
-        track(opened, work, tracking, workers=workers, overwrite=overwrite)
-    registered = register(opened, work, config, tracked=tracked, workers=workers, overwrite=overwrite)
+        track(opened, folder, tracking, workers=workers, overwrite="track" in anew)
+    registered = register(opened, folder, config, tracked=tracked, workers=workers, overwrite="register" in anew)
     if not draw:
         return registered
-    page = report(_path(work), capture=opened, workers=workers, overwrite=overwrite).path
+    page = report(folder, capture=opened, workers=workers, overwrite=overwrite).path
     return replace(registered, path=page)
+
+
+def changes(
+    capture: AnyCapture,
+    work: AnyWork,
+    config: RegistrationConfig | None = None,
+    *,
+    tracking: TrackingConfig | None = None,
+    tracked: bool = False,
+) -> list[StageChanges]:
+    """What the stages of `run` would do again, and why, in their order; nothing is done, nor written.
+
+    Frames that a stage would do because of what comes out of a stage before it are among its `following`, at least.
+    """
+    from capture4d.extraction.stage import ExtractionSettings
+    from capture4d.extraction.stage import changes as extraction
+    from capture4d.tracking.stage import changes as track_changes
+    from registration.stage import changes as registration
+
+    opened, folder = _capture(capture), _path(work)
+    found = [extraction(opened, folder / "garment", ExtractionSettings())]
+    tracked = tracked or _needs_tracking(opened)
+    if tracked:
+        found.append(track_changes(opened, folder / "body", tracking or TrackingConfig()))
+    last = registration(
+        opened,
+        folder / "garment",
+        folder / "registration",
+        config or RegistrationConfig(),
+        body_folder=folder / "body" if tracked else None,
+    )
+    return [*found, last.after(found)]
+
+
+def renew(work: AnyWork, what: Collection[str]) -> None:
+    """Let the next run find anew what the whole take decides, and is kept otherwise: "shape", "colours".
+
+    Raises:
+        InputError: it decides no such thing.
+    """
+    forget_decisions(_path(work), what)
+
+
+def take_over(work: AnyWork, like: AnyWork) -> None:
+    """Let the stages of a take go by the shape and the learned colours of another, instead of finding their own.
+
+    Args:
+        work: folder in which nothing has been tracked and extracted yet.
+        like: work folder of a take of the same person, in the same clothes.
+    """
+    take_over_decisions(_path(work), _path(like))
+
+
+def _made_anew(found: Sequence[StageChanges]) -> tuple[str, ...]:
+    """The stages that --overwrite is meant for: the first whose settings have changed and those after it, or all."""
+    first = next((at for at, stage in enumerate(found) if stage.settings), 0)
+    return tuple(stage.name for stage in found[first:])
 
 
 def _needs_tracking(capture: Capture) -> bool:

@@ -70,7 +70,7 @@ def open_sequence(path: Path) -> MeshSequence:
     if not path.is_dir():
         found = "a file" if path.exists() else "nothing"
         raise InputError(f"expected a folder of mesh files or an npz, found {found}", where=path)
-    found = list_scans(path, companions_below=False)
+    found = list_scans(path)
     for number, others in found.also.items():
         raise InputError(f"has the frame number {number} of {found.scans[number].name}", where=others[0])
     if not found.scans:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64
 
 from capture4d.errors import InputError
 from capture4d.types import GarmentScan
@@ -39,17 +39,23 @@ class FrameResult:
     linear_iterations: int
     cpu_s: float
     """Process time of preparing, fitting and assessing."""
+    position: int
+    """In the take."""
+    before: int | None
+    """Position of the frame that it could start from; None of the first of a segment."""
 
 
-def segments(mover: Mover | None, frames: int, config: SequenceConfig) -> list[range]:
+def segments(bend: Float64[np.ndarray, " frames"] | None, frames: int, config: SequenceConfig) -> list[range]:
     """The take cut at its keyframes, as positions; every segment begins with one.
 
     A keyframe is the frame nearest to the rest pose among its neighbours, near enough for the skinned template, and at
     least `config.segment` frames after the one before. Without poses there is one segment.
+
+    Args:
+        bend: how far each frame's joints are from the rest pose, as `bend_deg` has it; None without poses.
     """
     starts = [0]
-    if mover is not None:
-        bend = mover.bend_deg()
+    if bend is not None:
         reach = max(config.segment // 4, 1)
         for position in range(1, frames):
             around = bend[max(position - reach, 0) : position + reach + 1]
@@ -69,7 +75,7 @@ def register_run(
     frame_ids: Sequence[int],
     *,
     load: Callable[[int], GarmentScan],
-    done: Callable[[int], tuple[np.ndarray, bool] | None],
+    done: Callable[[int, int | None], tuple[np.ndarray, bool] | None],
     config: RegistrationConfig,
 ) -> Iterator[FrameResult]:
     """Register frames one from the other; yields those that were not done before.
@@ -78,14 +84,15 @@ def register_run(
         positions: of the frames in the take, ascending.
         frame_ids: of the whole take.
         load: the garment scan of a frame; may raise InputError, which flags the frame.
-        done: vertices of a frame that was finished earlier and whether they may be built upon, or None.
+        done: of the frame at a position, if it was finished earlier, starting from the frame at another (None for the
+            first of a segment): its vertices, and whether they may be built upon; else None.
     Raises:
         UnknownBorderError: paints are named after loops that the template lacks.
     """
     before: tuple[np.ndarray, int] | None = None
     for position in positions:
         frame_id = frame_ids[position]
-        earlier = done(frame_id)
+        earlier = done(position, None if before is None else before[1])
         if earlier is not None:
             vertices, sound = earlier
         else:
@@ -105,7 +112,7 @@ def _register_one(
     load: Callable[[int], GarmentScan],
     config: RegistrationConfig,
 ) -> FrameResult:
-    begin = time.process_time()
+    begin, at = time.process_time(), None if before is None else before[1]
     candidates = predict(analysis, mover, index, before, config)
     name, start = next(iter(candidates.items()))
     try:
@@ -122,8 +129,10 @@ def _register_one(
             name,
             0,
             time.process_time() - begin,
+            index,
+            at,
         )
     vertices = fitted.vertices.astype(np.float32)
     quality = assess(analysis, scan, vertices.astype(np.float64), config.quality)
     cpu_s = time.process_time() - begin
-    return FrameResult(frame_id, vertices, quality, f"{name}, {schedule}", fitted.linear_iterations, cpu_s)
+    return FrameResult(frame_id, vertices, quality, f"{name}, {schedule}", fitted.linear_iterations, cpu_s, index, at)

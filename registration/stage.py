@@ -7,11 +7,17 @@ frames/000123.npz         vertices (V, 3) float32, verdict (0 good, 1 check, 2 f
 metrics/000123.json       the frame's numbers, reasons and CPU time
 vertices.npy              (T, V, 3) float32, all frames
 metrics.jsonl             the frames' metrics, one per line
+
+A frame is made from the garment of its scan, the template, the body and its pose, and from the frame that it starts
+from, with that frame's pose. What is changed in a frame goes on to the frames after it in its segment, as far as they
+come out otherwise.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import hashlib
+from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +30,7 @@ from capture4d.captures.work_folder import (
     VERDICTS,
     load_records,
     load_tracking,
+    require_from_scans,
     stack_vertices,
     tracking_digest,
 )
@@ -31,28 +38,20 @@ from capture4d.errors import InputError
 from capture4d.files.arrays import ArrayFile
 from capture4d.files.atomic import nan_to_none, read_json, write_json, write_json_lines, write_npz
 from capture4d.files.records import save_garment
-from capture4d.runs.stage import Stage, StageResult, open_stage, require_complete
+from capture4d.runs.changes import StageChanges
+from capture4d.runs.growing import GrowingStage, Pending, Reads, open_growing_stage, stage_changes
+from capture4d.runs.made import Ledger, digest_of, noted
+from capture4d.runs.stage import Stage, StageResult
 from capture4d.runs.workers import run_jobs, shared
+from capture4d.types import Body, Garment, PoseSequence
 from registration.config import RegistrationConfig
-from registration.predictions import Mover
+from registration.predictions import Mover, bend_deg
 from registration.sequence import FrameResult, register_run, segments
 from registration.template import TemplateAnalysis, analyse_template
 
-__all__ = ["run"]
+__all__ = ["changes", "run"]
 
-SCHEMA = 3
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Take:
-    """What all segments of a take share: the template on the person who moves it, ready to be registered."""
-
-    analysis: TemplateAnalysis
-    mover: Mover | None
-    config: RegistrationConfig
-    frame_ids: tuple[int, ...]
-    garment_folder: Path
-    stage: Stage
+SCHEMA = 4
 
 
 def run(
@@ -65,7 +64,7 @@ def run(
     workers: int = 1,
     overwrite: bool = False,
 ) -> StageResult:
-    """Register the template to every frame that has none yet.
+    """Register the template to every frame that has none yet, or was made from something else.
 
     Args:
         body_folder: tracked body to move the template with; None takes the poses that the capture brings.
@@ -74,42 +73,40 @@ def run(
             disagree.
     """
     command = f"capture4d extract {capture.path} --output {output.parent}"
-    made_from = {"capture": capture.digest}
-    upstream = {
-        "garment": require_complete(garment_folder, "extract", command, made_from=made_from),
-        "template": capture.template_digest,
-    }
+    digest, garments = require_from_scans(garment_folder, "extract", command, capture)
+    stages = {"garment": digest}
     if body_folder is not None:
-        upstream["body"] = tracking_digest(body_folder, capture)
-    elif capture.motion_digest:
-        upstream["motion"] = capture.motion_digest
-    stage = open_stage(output, name=REGISTER, schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite)
-    moving = capture.posed_body if body_folder is None else load_tracking(body_folder)
-    garment = capture.template if moving is None else with_body_shape(capture.template, moving[0], moving[1].shape)
-    if capture.boundary_colours and not garment.loops:
-        raise InputError("expected a template with open borders, as its scans have; found none", where=capture.path)
-    if not (output / "garment.npz").is_file():
-        save_garment(output / "garment.npz", garment)
-    pending = set(stage.pending(capture.frame_ids))
-    if pending:
+        stages["body"] = tracking_digest(body_folder, capture)
+    stage = open_growing_stage(
+        output,
+        name=REGISTER,
+        schema=SCHEMA,
+        config=config,
+        reads=_reads(capture, stages, body_folder),
+        sources={"capture": capture.path},
+        overwrite=overwrite,
+    )
+    moving = _moving(capture, body_folder)
+    garment = _shaped(capture, moving)
+    path = output / "garment.npz"
+    stage.make_unless_standing(path, lambda: save_garment(path, garment), inputs={"garment": _garment_digest(garment)})
+    chain = _chain(capture, stage.ledger, garments, config, (garment, moving), body_folder)
+    jobs = [each for each in chain.segments if chain.first_stale(each) is not None]
+    if jobs:
         analysis = analyse_template(garment, config)
         mover = None if moving is None else Mover.create(analysis, *moving)
-        take = _Take(analysis, mover, config, capture.frame_ids, garment_folder, stage)
-        jobs = _segments(take, pending)
+        take = _Take(analysis, mover, config, garment_folder, stage, chain)
         for _ in run_jobs(
             _register_segment, jobs, prepare=shared(take), workers=workers, label="register", units=len,
-            finished=stage.count,
+            finished=partial(noted, output),
         ):  # fmt: skip
             pass
-    gathered = all((output / name).is_file() for name in ("vertices.npy", "metrics.jsonl"))
-    changed = bool(pending) or not gathered or not stage.was_complete
-    if changed:
-        _gather(stage, capture.frame_ids)
-    frames = [stage.frame_path(frame_id) for frame_id in capture.frame_ids]
-    return stage.finish(
-        [output / "garment.npz", output / "vertices.npy", *frames],
-        changed=changed,
-        frames=len(frames),
+        stage = stage.with_notes()
+    paths = [stage.frame_path(frame_id) for frame_id in capture.frame_ids]
+    _gather(stage, capture.frame_ids, stage.digest_of_all(paths))
+    return stage.finish_growing(
+        [path, output / "vertices.npy", *paths],
+        frames=len(paths),
         failed={
             record["frame_id"]: "; ".join(record["reasons"])
             for record in load_records(output)
@@ -118,40 +115,208 @@ def run(
     )
 
 
-def _segments(take: _Take, pending: set[int]) -> list[range]:
-    """Positions of frames that belong together, where any of them is still to be done."""
-    return [
-        positions
-        for positions in segments(take.mover, len(take.frame_ids), take.config.sequence)
-        if pending.intersection(take.frame_ids[position] for position in positions)
-    ]
+def changes(
+    capture: Capture,
+    garment_folder: Path,
+    output: Path,
+    config: RegistrationConfig,
+    *,
+    body_folder: Path | None = None,
+) -> StageChanges:
+    """What `run` would do with the garments and the body that are there now, and why; nothing is done."""
+
+    def pending(ledger: Ledger) -> Pending:
+        garments = Ledger.read(garment_folder)
+        if body_folder is not None and not (body_folder / "poses.npz").is_file():
+            return Pending(capture.frame_ids)
+        moving = _moving(capture, body_folder)
+        chain = _chain(capture, ledger, garments, config, (_shaped(capture, moving), moving), body_folder)
+        certain, following = set[int](), set[int]()
+        for positions in chain.segments:
+            first = chain.first_stale(positions)
+            if first is not None:
+                certain.add(first)
+                following.update(position for position in positions if position > first)
+        missing = {at for at, each in enumerate(capture.frame_ids) if ledger.of(chain.path(each)) is None}
+        certain |= following & missing
+        ids = capture.frame_ids
+        return Pending(tuple(ids[at] for at in sorted(certain)), tuple(ids[at] for at in sorted(following - certain)))
+
+    return stage_changes(
+        output, name=REGISTER, schema=SCHEMA, config=config, reads=_reads(capture, {}, body_folder), pending=pending
+    )
+
+
+def _reads(capture: Capture, stages: dict[str, str], body_folder: Path | None) -> Reads:
+    named = {"template": capture.template_digest}
+    if body_folder is None and capture.motion_digest:
+        named["motion"] = capture.motion_digest
+    if not stages:
+        stages = dict.fromkeys(("garment", "body"), "")
+    return Reads({}, named, capture.frame_ids, capture.left_out, stages)
+
+
+def _moving(capture: Capture, body_folder: Path | None) -> tuple[Body, PoseSequence] | None:
+    """The body that moves the template, and its poses, a frame of the take each."""
+    if body_folder is None:
+        return capture.posed_body
+    body, poses = load_tracking(body_folder)
+    return body, poses.of_frames(np.array(capture.frame_ids, np.int32))
+
+
+def _shaped(capture: Capture, moving: tuple[Body, PoseSequence] | None) -> Garment:
+    """The template on the person who moves it."""
+    garment = capture.template if moving is None else with_body_shape(capture.template, moving[0], moving[1].shape)
+    if capture.boundary_colours and not garment.loops:
+        raise InputError("expected a template with open borders, as its scans have; found none", where=capture.path)
+    return garment
+
+
+# --- what a frame is made from -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Chain:
+    """What each frame would be made from, by position in the take."""
+
+    ledger: Ledger
+    frame_ids: tuple[int, ...]
+    settings: str
+    """Digest of what all frames share: settings, template, body."""
+    garments: tuple[str, ...]
+    """Digest of the garment of each frame's scan."""
+    poses: tuple[str, ...]
+    """Of each frame's pose; empty without poses."""
+    segments: tuple[range, ...]
+    """The take cut at its keyframes."""
+    reads_before: bool
+    """Whether a frame starts from the one before; else it matters only that there is one."""
+
+    def path(self, frame_id: int) -> Path:
+        return self.ledger.folder / "frames" / f"{frame_id:06d}.npz"
+
+    def inputs(self, position: int, before: int | None) -> dict[str, str]:
+        """What the frame at a position is made from, if it can start from the one at another."""
+        found = {"settings": self.settings, "garment": self.garments[position], "pose": self.poses[position]}
+        if before is None or not self.reads_before:
+            return {**found, "start": "distant" if before is None else "near"}
+        made = self.ledger.of(self.path(self.frame_ids[before]))
+        assert made is not None
+        return {**found, "start": f"{made.digest} {self.poses[before]}"}
+
+    def stands(self, position: int, before: int | None) -> bool:
+        return self.ledger.stands(self.path(self.frame_ids[position]), self.inputs(position, before))
+
+    def first_stale(self, positions: range) -> int | None:
+        """The first frame of a segment that is to be registered, None if all stand."""
+        before = None
+        for position in positions:
+            if not self.stands(position, before):
+                return position
+            made = self.ledger.of(self.path(self.frame_ids[position]))
+            assert made is not None
+            before = position if made.said["sound"] else before
+        return None
+
+
+def _chain(
+    capture: Capture,
+    ledger: Ledger,
+    garments: Ledger,
+    config: RegistrationConfig,
+    template: tuple[Garment, tuple[Body, PoseSequence] | None],
+    body_folder: Path | None,
+) -> _Chain:
+    garment, moving = template
+    frame_ids, body, poses = capture.frame_ids, "", [""] * len(capture.frame_ids)
+    pieces = segments(None, len(frame_ids), config.sequence)
+    if moving is not None and garment.skin_weights is not None:
+        body = capture.body_digest or "built-in"
+        if body_folder is not None:
+            made = Ledger.read(body_folder).of(body_folder / "body.npz")
+            body = "" if made is None else made.digest
+        body = digest_of([body, moving[1].shape])
+        poses = [_array_digest(moving[1].rotations[row], moving[1].translations[row]) for row in range(len(frame_ids))]
+        pieces = segments(bend_deg(garment.skin_weights, moving[1]), len(frame_ids), config.sequence)
+    read = asdict(config)
+    for cut in ("segment", "keyframe_bend_deg"):  # what they decide shows in where frames start from
+        del read["sequence"][cut]
+    found = [garments.of(garments.folder / "frames" / f"{frame_id:06d}.npz") for frame_id in frame_ids]
+    return _Chain(
+        ledger,
+        frame_ids,
+        digest_of([read, _garment_digest(garment), body]),
+        tuple("" if each is None else each.digest for each in found),
+        tuple(poses),
+        tuple(pieces),
+        config.sequence.start != "skinned",
+    )
+
+
+def _garment_digest(garment: Garment) -> str:
+    template = garment.template
+    arrays = [template.vertices, template.faces, *garment.loops.values()]
+    arrays += [each for each in (template.uv, garment.skin_weights) if each is not None]
+    return digest_of([_array_digest(*arrays), list(garment.loops)])
+
+
+def _array_digest(*arrays: np.ndarray) -> str:
+    total = hashlib.sha256()
+    for each in arrays:
+        total.update(f"{each.dtype} {each.shape} ".encode())
+        total.update(np.ascontiguousarray(each).tobytes())
+    return total.hexdigest()
+
+
+# --- frames ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Take:
+    """What all segments of a take share: the template on the person who moves it, ready to be registered."""
+
+    analysis: TemplateAnalysis
+    mover: Mover | None
+    config: RegistrationConfig
+    garment_folder: Path
+    stage: GrowingStage
+    chain: _Chain
 
 
 def _register_segment(take: _Take, positions: range) -> int:
-    """Register and write the frames of a segment; how many were new."""
-    frame_ids, stage = take.frame_ids, take.stage
-    pending = set(stage.pending([frame_ids[position] for position in positions]))
+    """Register and write the frames of a segment that do not stand; how many they were."""
+    chain = take.chain
 
-    def done(frame_id: int) -> tuple[np.ndarray, bool] | None:
-        if frame_id in pending:
+    def done(position: int, before: int | None) -> tuple[np.ndarray, bool] | None:
+        if not chain.stands(position, before):
             return None
-        with ArrayFile(stage.frame_path(frame_id)) as arrays:
+        with ArrayFile(chain.path(chain.frame_ids[position])) as arrays:
             return arrays["vertices"], VERDICTS[int(arrays["verdict"])] != "failed"
 
     results = register_run(
         take.analysis,
         take.mover,
         positions,
-        frame_ids,
+        chain.frame_ids,
         load=lambda frame_id: load_garment_scan(take.garment_folder / "frames" / f"{frame_id:06d}.npz", frame_id),
         done=done,
         config=take.config,
     )
     count = 0
     for result in results:
-        _write_frame(stage, result)
+        _make_frame(take, result)
         count += 1
     return count
+
+
+def _make_frame(take: _Take, result: FrameResult) -> None:
+    stage = take.stage
+    stage.make(
+        stage.frame_path(result.frame_id),
+        lambda: _write_frame(stage, result),
+        inputs=take.chain.inputs(result.position, result.before),
+        said={"sound": result.quality.verdict != "failed"},
+    )
 
 
 def _write_frame(stage: Stage, result: FrameResult) -> None:
@@ -181,8 +346,9 @@ def _metrics_path(stage: Stage, frame_id: int) -> Path:
     return stage.frame_path(frame_id, ".json", folder="metrics")
 
 
-def _gather(stage: Stage, frame_ids: tuple[int, ...]) -> None:
-    """Stack the frames and their metrics."""
-    stack_vertices(stage, frame_ids)
+def _gather(stage: GrowingStage, frame_ids: tuple[int, ...], digest: str) -> None:
+    """Stack the frames and their metrics, unless these are stacked."""
+    vertices, metrics = stage.path / "vertices.npy", stage.path / "metrics.jsonl"
     records = (read_json(_metrics_path(stage, frame_id)) for frame_id in frame_ids)
-    write_json_lines(stage.path / "metrics.jsonl", records)
+    stage.make_unless_standing(vertices, lambda: stack_vertices(stage, frame_ids), inputs={"frames": digest})
+    stage.make_unless_standing(metrics, lambda: write_json_lines(metrics, records), inputs={"frames": digest})

@@ -13,8 +13,6 @@ docs/reference/files.md describes every file, so that it can be written without 
 
 from __future__ import annotations
 
-import contextlib
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -40,6 +38,7 @@ from capture4d.files.records import (
 from capture4d.geometry.mesh import boundary_loops
 from capture4d.geometry.seams import welded_mesh
 from capture4d.mesh_files.meshes import READABLE, read_mesh, write_mesh
+from capture4d.runs.frame_lists import chosen_frames
 from capture4d.types import Body, Garment, PoseSequence, Rig, Scan
 from capture4d.units import METRES, Units
 from capture4d.value_checks import require_frame_rate
@@ -47,18 +46,14 @@ from capture4d.value_checks import require_frame_rate
 __all__ = [
     "Capture",
     "CaptureFiles",
-    "capture_digest",
     "read_capture",
     "read_frame",
     "read_scan",
-    "scan_digest",
     "scan_path",
     "template_path",
     "write_capture_description",
     "write_scan",
 ]
-
-_END = 65_536
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,8 +64,6 @@ class CaptureFiles:
     """Of capture.json."""
     scans: Mapping[int, Path]
     """By frame number."""
-    companions: tuple[Path, ...]
-    """Textures and what else belongs to the scans, in their folder and those below it, by name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +88,8 @@ class Capture:
     """Of the scan files. What `read_scan` returns is in metres."""
     files: CaptureFiles | None = None
     """None for a capture that was not read from a folder: its files are looked up when they are asked for."""
+    left_out: tuple[int, ...] = ()
+    """Frames of the take that are not to be worked on."""
 
     def __post_init__(self) -> None:
         if not self.frame_ids:
@@ -116,10 +111,30 @@ class Capture:
         """Time of a frame since the first."""
         return (frame_id - self.frame_ids[0]) / self.fps
 
-    @cached_property
-    def digest(self) -> str:
-        """Of the description and the scans, which every stage starts from."""
-        return capture_digest(self)
+    def choosing(self, frames: str | None) -> Capture:
+        """The take with no other frames than those that a text names, such as "1,5,10-20" or "1-200:5".
+
+        Raises:
+            InputError: it names none of the take's.
+        """
+        if frames is None:
+            return self
+        chosen = chosen_frames(frames, self.frame_ids)
+        left_out = sorted({*self.left_out, *self.frame_ids} - set(chosen))
+        return replace(self, frame_ids=chosen, left_out=tuple(left_out))
+
+    def entries(self, *names: str) -> dict[str, Any]:
+        """What capture.json says, as JSON, of `fps`, `units`, `garment_colour`, `boundary_colours`; and its `paints`,
+        which are the latter without their names."""
+        boundary = {name: format_colour(colour) for name, colour in self.boundary_colours.items()}
+        said = {
+            "fps": self.fps,
+            "units": self.units,
+            "garment_colour": None if self.garment_colour is None else format_colour(self.garment_colour),
+            "boundary_colours": boundary,
+            "paints": list(dict.fromkeys(boundary.values())),
+        }
+        return {name: said[name] for name in names}
 
     @cached_property
     def template(self) -> Garment:
@@ -254,7 +269,7 @@ def read_capture(path: str | Path, *, scans: bool = True) -> Capture:
 
 def _list_files(path: Path) -> CaptureFiles:
     found = list_scans(path / "scans")
-    return CaptureFiles((path / "capture.json").read_bytes(), found.scans, found.companions)
+    return CaptureFiles((path / "capture.json").read_bytes(), found.scans)
 
 
 def _expected_scan(path: Path, frame_id: int) -> Path:
@@ -288,7 +303,7 @@ def scan_path(capture: Capture, frame_id: int) -> Path:
     else:
         named = (capture.path / "scans" / f"{frame_id:06d}{suffix}" for suffix in KINDS)
         found = next((path for path in named if path.is_file()), None)
-        found = found or list_scans(capture.path / "scans", companions_below=False).scans.get(frame_id)
+        found = found or list_scans(capture.path / "scans").scans.get(frame_id)
     if found is None:
         raise InputError("no such scan", where=_expected_scan(capture.path, frame_id))
     return found
@@ -317,39 +332,6 @@ def read_frame(capture: Capture, frame_id: int) -> tuple[Scan, bool]:
 
 def write_scan(path: str | Path, scan: Scan) -> None:
     write_mesh(path, scan.mesh, colours=scan.colours)
-
-
-def capture_digest(capture: Capture, *, instead: Mapping[int, str] | None = None) -> str:
-    """Digest of the description and the scans, which every stage starts from.
-
-    Args:
-        instead: digests of scans to count instead of those that are there now, by frame.
-    """
-    files = capture.files or _list_files(capture.path)
-    total = hashlib.sha256(files.description)
-    for frame_id in capture.frame_ids:
-        digest = (instead or {}).get(frame_id) or scan_digest(scan_path(capture, frame_id))
-        total.update(f"{frame_id} {digest}\n".encode())
-    for path in files.companions:
-        name = path.relative_to(capture.path / "scans").as_posix()
-        total.update(f"{name} {scan_digest(path)}\n".encode("utf-8", "surrogateescape"))
-    return total.hexdigest()
-
-
-def scan_digest(path: Path) -> str:
-    """Digest of a scan or its texture: name, size, first and last 64 kB, for takes are too large to be read twice.
-
-    Of what cannot be opened, or is no file, name and size alone: that is a fault of its frame, not of the take.
-    """
-    size = path.stat().st_size
-    total = hashlib.sha256(f"{path.name} {size}\n".encode("utf-8", "surrogateescape"))
-    if not path.is_file():  # a pipe would wait for its writer
-        return total.hexdigest()
-    with contextlib.suppress(OSError), path.open("rb") as file:
-        ends = file.read(_END)
-        file.seek(max(size - _END, _END))
-        total.update(ends + file.read(_END))
-    return total.hexdigest()
 
 
 # --- what else a capture may hold --------------------------------------------------------------------------------

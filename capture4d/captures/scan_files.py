@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -27,8 +27,6 @@ __all__ = ["KINDS", "ScanFiles", "Surface", "frame_numbers", "list_scans", "read
 
 KINDS = (".ply", ".glb", ".gltf", ".obj", ".off", ".stl")
 """Of several files with one number the first kind counts, and there the first name."""
-COMPANIONS = (".mtl", ".bin", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".tga")
-"""What may lie beside the scans or in folders below, and belongs to them: materials, buffers, textures."""
 LARGEST, SMALLEST = 1e9, 1e-4
 """Coordinates, and extents: a thousand kilometres in millimetres, where a float32 knows no person any more, and a tenth
 of a millimetre in metres."""
@@ -43,26 +41,17 @@ class ScanFiles:
     """By frame number, ascending."""
     also: Mapping[int, tuple[Path, ...]]
     """Further files with a number that has one already; they are not taken."""
-    companions: tuple[Path, ...]
-    """By name."""
 
 
-def list_scans(folder: Path, pattern: str | None = None, *, companions_below: bool = True) -> ScanFiles:
+def list_scans(folder: Path, pattern: str | None = None) -> ScanFiles:
     """Find the frames in a folder. Hidden files are no scans, nor is what has no number.
 
     Args:
         pattern: name of a scan, `{frame}` in place of its number; else `frame_numbers` tells.
-        companions_below: look for companions in the folders below, too.
     Raises:
         InputError: the pattern has no {frame}, or a number is too large.
     """
-    files, companions = [], []
-    for path in sorted(_files(folder, below=companions_below)):
-        suffix = path.suffix.lower()
-        if suffix in READABLE and path.parent == folder and not _is_template(path):
-            files.append(path)
-        elif suffix in COMPANIONS:
-            companions.append(path)
+    files = [path for path in _files(folder) if path.suffix.lower() in READABLE and not _is_template(path)]
     found: dict[int, list[Path]] = {}
     for path, number in zip(files, _numbers(files, pattern), strict=True):
         if number is None or not path.is_file():
@@ -79,27 +68,15 @@ def list_scans(folder: Path, pattern: str | None = None, *, companions_below: bo
     return ScanFiles(
         scans={number: paths[0] for number, paths in ranked.items()},
         also={number: tuple(paths[1:]) for number, paths in ranked.items() if len(paths) > 1},
-        companions=tuple(path for path in companions if path.is_file()),
     )
 
 
-def _files(folder: Path, *, below: bool, seen: frozenset[str] = frozenset()) -> Iterator[Path]:
-    """Files of a folder and of those below it, but for hidden ones; links are followed, but in no circle."""
-    place = os.path.realpath(folder)
-    if place in seen or not folder.is_dir():
-        return
+def _files(folder: Path) -> list[Path]:
+    """What is in a folder and not hidden, by name."""
+    if not folder.is_dir():
+        return []
     with os.scandir(folder) as entries:
-        for entry in entries:
-            if entry.name.startswith("."):
-                continue
-            try:
-                is_folder = entry.is_dir()
-            except OSError:  # a link that leads in a circle
-                is_folder = False
-            if not is_folder:
-                yield folder / entry.name
-            elif below:
-                yield from _files(folder / entry.name, below=True, seen=seen | {place})
+        return sorted(folder / entry.name for entry in entries if not entry.name.startswith("."))
 
 
 def _is_template(path: Path) -> bool:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from capture4d.captures.capture import Capture, read_capture
+from capture4d.captures.scan_states import replaced_scan
 from capture4d.errors import InputError, StaleError
 from capture4d.files.arrays import ArrayFile, map_array
 from capture4d.files.atomic import (
@@ -23,7 +24,11 @@ from capture4d.files.atomic import (
 )
 from capture4d.files.reading import reading
 from capture4d.files.records import load_body, load_garment, load_poses
-from capture4d.runs.stage import Stage, read_record, require_complete
+from capture4d.runs.changes import description_changes, frame_changes
+from capture4d.runs.frame_lists import counted
+from capture4d.runs.growing import frames_of
+from capture4d.runs.made import Ledger
+from capture4d.runs.stage import Stage, complete_record, read_record, require_complete
 from capture4d.types import Body, PoseSequence, RegisteredSequence
 
 __all__ = [
@@ -35,6 +40,7 @@ __all__ = [
     "load_registration",
     "load_tracking",
     "open_work",
+    "require_from_scans",
     "stack_vertices",
     "tracking_digest",
 ]
@@ -174,7 +180,30 @@ def tracking_digest(folder: Path, capture: Capture) -> str:
         InputError: it is missing, unfinished, or that of other scans.
     """
     command = f"capture4d track {capture.path} --output {folder.parent}"
-    return require_complete(folder, "track", command, made_from={"capture": capture.digest})
+    return require_from_scans(folder, "track", command, capture)[0]
+
+
+def require_from_scans(folder: Path, name: str, command: str, capture: Capture) -> tuple[str, Ledger]:
+    """The digest of a finished stage that goes by frames, and what its files were made from.
+
+    Raises:
+        InputError: it is missing, unfinished, or that of other scans, frames, or entries of capture.json; the message
+            says what has changed, and names `command`, which goes on from there.
+    """
+    record, ledger = complete_record(folder, name, command), Ledger.read(folder)
+    made_for = frames_of(record)
+    if made_for is None:
+        raise StaleError(f"'{name}' is of an earlier version of capture4d; run: {command} --overwrite", where=folder)
+    words = frame_changes(sorted({*capture.frame_ids, *made_for}), made_for)  # more than are asked for will do
+    said = record.get("description", {})
+    words += description_changes(capture.entries(*said), said)
+    paths = {frame_id: folder / "frames" / f"{frame_id:06d}.npz" for frame_id in {*capture.frame_ids} & {*made_for}}
+    replaced = sorted(each for each, path in paths.items() if replaced_scan(ledger, path, capture, each))
+    if replaced:
+        words.append(counted(replaced, "replaced"))
+    if words:
+        raise StaleError(f"'{name}' is of the take as it was before ({', '.join(words)}); run: {command}", where=folder)
+    return record["digest"], ledger
 
 
 def load_tracking(folder: Path) -> tuple[Body, PoseSequence]:
@@ -185,7 +214,11 @@ def load_tracking(folder: Path) -> tuple[Body, PoseSequence]:
 def load_registration(folder: Path) -> RegisteredSequence:
     """Read a finished WORK/registration; the vertices stay on disk until they are touched."""
     garment = load_garment(folder / "garment.npz")
-    frame_ids = [int(path.stem) for path in sorted((folder / "frames").glob("*.npz"))]
+    record = read_record(folder / "stage.json") if (folder / "stage.json").is_file() else {}
+    made_for = frames_of(record)
+    frame_ids = (
+        [int(path.stem) for path in sorted((folder / "frames").glob("*.npz"))] if made_for is None else list(made_for)
+    )
     residual = []
     for frame_id in frame_ids:
         with ArrayFile(folder / "frames" / f"{frame_id:06d}.npz") as arrays:

@@ -140,7 +140,7 @@ def _run(arguments: list[str]) -> int:
     except OSError as error:
         if error.errno not in _DISK_ANSWERS or (error.filename is None and error.errno != errno.ENOSPC):
             raise
-        kept = "; finished frames are kept, the same command goes on" if error.errno == errno.ENOSPC else ""
+        kept = f"; {_what_goes_on(arguments)}" if error.errno == errno.ENOSPC else ""
         return _complain(f"{error.filename or 'output'}: {error.strerror}{kept}")
     except RuntimeError as error:
         from capture4d.runs.workers import WorkerDied
@@ -154,9 +154,16 @@ def _run(arguments: list[str]) -> int:
             raise
         return _complain(said)
     except KeyboardInterrupt:
-        return _complain("interrupted; finished frames are kept, the same command goes on", code=INTERRUPTED)
+        return _complain(f"interrupted; {_what_goes_on(arguments)}", code=INTERRUPTED)
     except _TerminatedError:
-        return _complain("terminated; finished frames are kept, the same command goes on", code=TERMINATED)
+        return _complain(f"terminated; {_what_goes_on(arguments)}", code=TERMINATED)
+
+
+def _what_goes_on(arguments: Sequence[str]) -> str:
+    """What becomes of a command that was stopped."""
+    if "--overwrite" in arguments:
+        return "finished frames are kept; without --overwrite the same command goes on, with it it begins anew"
+    return "finished frames are kept, the same command goes on"
 
 
 def _dispatch(arguments: list[str]) -> int:

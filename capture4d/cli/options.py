@@ -11,9 +11,12 @@ from capture4d.cli.exit_codes import BAD_RESULT, GOOD
 from capture4d.settings import Count, Percent
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
+    from capture4d.captures.capture import Capture
     from capture4d.runs.stage import StageResult
 
-__all__ = ["GradedOptions", "MeshOptions", "StageOptions", "all_cores"]
+__all__ = ["DecidingOptions", "GradedOptions", "MeshOptions", "StageOptions", "TakeOptions", "all_cores"]
 
 
 def all_cores() -> int:
@@ -37,6 +40,35 @@ class StageOptions:
     """Start clean: delete what an earlier run left in the output folder."""
     wait: bool = False
     """Wait for another command that is writing to the same folder, instead of refusing."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TakeOptions:
+    """Of commands that read a take frame by frame."""
+
+    frames: str | None = None
+    """Only these frames of the take, such as 1,5,10-20 or, every fifth, 1-200:5; what is known of others is kept."""
+
+    def taken(self, capture: Path) -> Capture:
+        """The capture in a folder, of the frames that are asked for."""
+        from capture4d.captures.capture import read_capture
+
+        return read_capture(capture).choosing(self.frames)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DecidingOptions(TakeOptions):
+    """Of commands that decide something for the whole take."""
+
+    renew: str = ""
+    """Find anew what the whole take decides and is kept otherwise when frames come or go: shape, colours, or both with
+    a comma between."""
+
+    def renewed(self, work: Path) -> None:
+        """Let a work folder find anew what is to be."""
+        from capture4d.runs.decisions import forget_decisions
+
+        forget_decisions(work, [name.strip() for name in self.renew.split(",") if name.strip()])
 
 
 @dataclass(frozen=True, kw_only=True)

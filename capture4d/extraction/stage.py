@@ -3,36 +3,55 @@
 Colours that capture.json does not give are learned from a few scans first, and written to colours.json. One of the
 first four frames that can be read must have all of them, or else capture.json is wrong. Any other frame that lacks
 them, because the subject has left the volume or hides a border, and any frame whose scan is damaged, gets the reason
-instead of a garment, and registration flags it. Damaged scans are read again in every run, in case they were repaired;
-other scans must not have changed.
+instead of a garment, and registration flags it. Damaged scans are read again in every run, in case they were repaired.
+
+A frame is made from its scan, the colours, and the unit of the scans.
 """
 
 from __future__ import annotations
 
-import zipfile
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from capture4d.captures.capture import Capture, capture_digest, read_frame, scan_digest, scan_path
+from capture4d.captures.capture import Capture, read_frame, scan_path
 from capture4d.captures.garment_scans import ESTIMATED, save_garment_scan
-from capture4d.captures.take_colours import KnownColours, take_colours, template_loops
-from capture4d.colours.spaces import format_colour
+from capture4d.captures.scan_states import (
+    DAMAGED,
+    replaced_scan,
+    require_same_take,
+    scan_digest,
+    scan_looked_at,
+    stands_with_scan,
+)
+from capture4d.captures.take_colours import (
+    COLOURS,
+    KnownColours,
+    colours_of_take,
+    described_colours,
+    kept_colours,
+    take_colours,
+    template_loops,
+)
 from capture4d.errors import InputError
 from capture4d.extraction.garment import ColourNotFoundError, cut_out
-from capture4d.files.arrays import ArrayFile
 from capture4d.files.atomic import write_json, write_npz
-from capture4d.runs.stage import Stage, StageResult, open_stage
-from capture4d.runs.workers import run_jobs
+from capture4d.runs.changes import StageChanges, say
+from capture4d.runs.frame_lists import counted, listed
+from capture4d.runs.growing import GrowingStage, Pending, Reads, open_growing_stage, stage_changes
+from capture4d.runs.made import Ledger, digest_of, make
+from capture4d.runs.stage import StageResult
+from capture4d.runs.workers import run_jobs, shared
 from capture4d.settings import Count, settings
 from capture4d.types import GarmentScan
 
-__all__ = ["CLOUDS", "ExtractionSettings", "estimated_frames", "flagged_frames", "run"]
+__all__ = ["CLOUDS", "ExtractionSettings", "changes", "run"]
 
-SCHEMA = 4
+SCHEMA = 5
+NAME = "extract"
 CLOUDS = "clouds.json"
 """Names the frames whose scans are points alone, so that normals and faces are estimated; not there without any."""
 LOOKED_AT = 4
@@ -49,92 +68,135 @@ class ExtractionSettings:
 
 
 def run(
-    capture: Capture, output: Path, config: ExtractionSettings, *, workers: int = 1, overwrite: bool = False
+    capture: Capture,
+    output: Path,
+    config: ExtractionSettings,
+    *,
+    workers: int = 1,
+    overwrite: bool = False,
 ) -> StageResult:
-    """Extract the garment of every frame that has none yet.
+    """Extract the garment of every frame that has none yet, or has that of another scan, or of other colours.
 
     Raises:
         InputError: a scan is missing, none can be read, or the first that can lack the garment's colours; or these are
             to be learned and are not separable.
     """
-    named = {}
-    if not capture.boundary_colours and (config.learn_colours or capture.garment_colour is None):
-        named["loops"] = " ".join(template_loops(capture))
-    before = _unreadable_scans(output, capture.frame_ids)
-    stage = open_stage(
+    if not overwrite:
+        require_same_take(output, capture)
+    stage = open_growing_stage(
         output,
-        name="extract",
+        name=NAME,
         schema=SCHEMA,
         config=config,
-        upstream={"capture": capture.digest, **named},
+        reads=_reads(capture, config),
         sources={"capture": capture.path},
-        formerly={"capture": capture_digest(capture, instead=before), **named} if before else None,
         overwrite=overwrite,
     )
-    colours_path = stage.path / "colours.json"
-    pending = sorted({*stage.pending(capture.frame_ids), *before})
-    if pending or not colours_path.is_file():
-        colours = take_colours(capture, learn=config.learn_colours)
-        write_json(colours_path, _described(colours))
-        done = _extract_first(capture, colours, stage, pending)
-        jobs = [(frame_id, stage.frame_path(frame_id)) for frame_id in pending if frame_id != done]
-        for _ in run_jobs(partial(write_frame, capture, colours), jobs, workers=workers, label="extract garment"):
-            pass
-    frames = [stage.frame_path(frame_id) for frame_id in capture.frame_ids]
-    if pending:
-        _say_estimated(output / CLOUDS, estimated_frames(output, capture.frame_ids))
-    return stage.finish(
-        [colours_path, *frames],
-        changed=bool(pending),
-        frames=len(capture.frame_ids),
-        failed=flagged_frames(output, capture.frame_ids),
+    taken = colours_of_take(capture, output, learn=config.learn_colours)
+    inputs = _inputs(capture, taken.colours)
+    pending = _pending(capture, stage.ledger, inputs)
+    if pending.replaced:
+        say(f"{output.name}: {counted(pending.replaced, 'replaced')}")
+    if pending.frames:
+        if taken.frames and not taken.newly and taken.frames != listed(capture.frame_ids, most=0):
+            say(f"{output.name}: the colours are kept as frames {taken.frames} gave them; "
+                "--renew colours learns them anew")  # fmt: skip
+        try:
+            _extract(_Extraction(capture, taken.colours, output, inputs), stage, pending.frames, workers)
+        except InputError:
+            if taken.newly:  # nothing was made with them
+                (output / COLOURS).unlink(missing_ok=True)
+            raise
+        stage = stage.with_notes()
+    if not taken.frames:
+        described = described_colours(taken.colours)
+        stage.make_unless_standing(
+            output / COLOURS, lambda: write_json(output / COLOURS, described), inputs={"colours": digest_of(described)}
+        )
+    _say_estimated(stage, capture.frame_ids)
+    paths = {frame_id: stage.frame_path(frame_id) for frame_id in capture.frame_ids}
+    said = {frame_id: _said(stage.ledger, path).get("reason", "") for frame_id, path in paths.items()}
+    return stage.finish_growing(
+        [*paths.values()],
+        frames=len(paths),
+        failed={frame_id: reason for frame_id, reason in said.items() if reason},
     )
 
 
-def _say_estimated(path: Path, frame_ids: tuple[int, ...]) -> None:
-    if frame_ids:
-        write_json(path, {"frames": frame_ids})
-    else:
+def changes(capture: Capture, output: Path, config: ExtractionSettings) -> StageChanges:
+    """What `run` would do, and why; nothing is done."""
+
+    def pending(ledger: Ledger) -> Pending:
+        if capture.garment_colour is not None and not config.learn_colours:
+            return _pending(capture, ledger, _inputs(capture, take_colours(capture)))
+        kept = kept_colours(capture, output, learn=config.learn_colours)
+        if kept is None:
+            return Pending(capture.frame_ids)
+        said = f"colours, learned from frames {kept.frames}"
+        return _pending(capture, ledger, _inputs(capture, kept.colours)).keeping(said)
+
+    return stage_changes(
+        output, name=NAME, schema=SCHEMA, config=config, reads=_reads(capture, config), pending=pending
+    )
+
+
+def _reads(capture: Capture, config: ExtractionSettings) -> Reads:
+    named = {}
+    if not capture.boundary_colours and (config.learn_colours or capture.garment_colour is None):
+        named["names of the template's borders"] = " ".join(template_loops(capture))
+    said = capture.entries("units", "garment_colour", "boundary_colours")
+    return Reads(said, named, capture.frame_ids, capture.left_out)
+
+
+def _inputs(capture: Capture, colours: KnownColours) -> dict[str, str]:
+    """What a frame is made from beside its scan."""
+    return {"colours": digest_of(described_colours(colours)), "settings": digest_of([SCHEMA, capture.units])}
+
+
+def _pending(capture: Capture, ledger: Ledger, inputs: Mapping[str, str]) -> Pending:
+    """Frames that are to be extracted."""
+    paths = {frame_id: ledger.folder / "frames" / f"{frame_id:06d}.npz" for frame_id in capture.frame_ids}
+    frames = [each for each, path in paths.items() if not stands_with_scan(ledger, path, capture, each, inputs)]
+    replaced = [each for each in frames if replaced_scan(ledger, paths[each], capture, each)]
+    return Pending(tuple(frames), replaced=tuple(replaced))
+
+
+def _said(ledger: Ledger, path: Path) -> Mapping[str, Any]:
+    made = ledger.of(path)
+    return {} if made is None else made.said
+
+
+def _say_estimated(stage: GrowingStage, frame_ids: Sequence[int]) -> None:
+    """Write down which frames' scans are points alone."""
+    path = stage.path / CLOUDS
+    found = [each for each in frame_ids if _said(stage.ledger, stage.frame_path(each)).get(ESTIMATED)]
+    if not found:
         path.unlink(missing_ok=True)
+    else:
+        stage.make_unless_standing(path, lambda: write_json(path, {"frames": found}), inputs={"frames": listed(found)})
 
 
-def flagged_frames(folder: Path, frame_ids: Sequence[int]) -> dict[int, str]:
-    """Frames of an extraction without a garment, and why."""
-    reasons = {frame_id: _reason(folder / "frames" / f"{frame_id:06d}.npz") for frame_id in frame_ids}
-    return {frame_id: reason for frame_id, reason in reasons.items() if reason}
+# --- frames ------------------------------------------------------------------------------------------------------
 
 
-def estimated_frames(folder: Path, frame_ids: Sequence[int]) -> tuple[int, ...]:
-    """Frames of an extraction whose scans are points alone."""
-    found = []
-    for frame_id in frame_ids:
-        with ArrayFile(folder / "frames" / f"{frame_id:06d}.npz") as arrays:
-            if ESTIMATED in arrays:
-                found.append(frame_id)
-    return tuple(found)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Extraction:
+    """What all frames share."""
+
+    capture: Capture
+    colours: KnownColours
+    folder: Path
+    inputs: Mapping[str, str]
 
 
-def _unreadable_scans(folder: Path, frame_ids: Sequence[int]) -> dict[int, str]:
-    """Frames whose scan an earlier run could not read, and what that scan's digest was."""
-    found = {}
-    for frame_id in frame_ids:
-        path = folder / "frames" / f"{frame_id:06d}.npz"
-        if zipfile.is_zipfile(path):
-            with ArrayFile(path) as arrays:
-                digest = arrays.get("scan")
-            if digest is not None:
-                found[frame_id] = str(digest)
-    return found
+def _extract(take: _Extraction, stage: GrowingStage, pending: Sequence[int], workers: int) -> None:
+    done = _extract_first(take, stage, pending)
+    jobs = [frame_id for frame_id in pending if frame_id != done]
+    for _ in run_jobs(write_frame, jobs, prepare=shared(take), workers=workers, label="extract garment"):
+        pass
 
 
-def _reason(path: Path) -> str:
-    """Why a frame has no garment, nothing if it has one."""
-    with ArrayFile(path) as arrays:
-        reason = arrays.get("reason")
-        return "" if reason is None else str(reason)
-
-
-def _extract_first(capture: Capture, colours: KnownColours, stage: Stage, pending: Sequence[int]) -> int | None:
+def _extract_first(take: _Extraction, stage: GrowingStage, pending: Sequence[int]) -> int | None:
     """Extract the first frame that has the garment, if that is not done, to see that the colours are right.
 
     Returns:
@@ -146,33 +208,21 @@ def _extract_first(capture: Capture, colours: KnownColours, stage: Stage, pendin
     absent: list[InputError] = []
     damaged: list[InputError] = []
     waiting = set(pending)
-    for frame_id in capture.frame_ids:
+    for frame_id in take.capture.frame_ids:
         if frame_id not in waiting:
-            if _reason(stage.frame_path(frame_id)):
+            if _said(stage.ledger, stage.frame_path(frame_id)).get("reason"):
                 continue
             return None
-        try:
-            found, estimated = extract_frame(capture, colours, frame_id)
-        except ColourNotFoundError as error:
-            absent.append(error)
+        fault = write_frame(take, frame_id, keep_faults=False)
+        if fault is None:
+            return frame_id
+        if isinstance(fault, ColourNotFoundError):
+            absent.append(fault)
             if len(absent) == LOOKED_AT:
                 break
-            continue
-        except InputError as error:
-            damaged.append(error)
-            continue
-        save_garment_scan(stage.frame_path(frame_id), found, estimated=estimated)
-        return frame_id
+        else:
+            damaged.append(fault)
     raise (absent or damaged)[0]
-
-
-def _described(colours: KnownColours) -> dict[str, Any]:
-    return {
-        "learned": colours.light is not None,
-        "garment_colour": format_colour(colours.garment),
-        "boundary_colours": {name: format_colour(colour) for name, colour in colours.boundary.items()},
-        "other_colours": [format_colour(colour) for colour in colours.others],
-    }
 
 
 def extract_frame(capture: Capture, colours: KnownColours, frame_id: int) -> tuple[GarmentScan, bool]:
@@ -181,13 +231,33 @@ def extract_frame(capture: Capture, colours: KnownColours, frame_id: int) -> tup
     return cut_out(scan, colours, source=str(scan_path(capture, frame_id))), estimated
 
 
-def write_frame(capture: Capture, colours: KnownColours, job: tuple[int, Path]) -> None:
-    """Extract one frame and write it, or the reason why there is nothing to write."""
-    frame_id, path = job
-    try:
-        found, estimated = extract_frame(capture, colours, frame_id)
-        save_garment_scan(path, found, estimated=estimated)
-    except InputError as error:
-        damaged = not isinstance(error, ColourNotFoundError)
-        source = {"scan": np.array(scan_digest(scan_path(capture, frame_id)))} if damaged else {}
-        write_npz(path, reason=np.array(str(error)), **source)
+def write_frame(take: _Extraction, frame_id: int, *, keep_faults: bool = True) -> InputError | None:
+    """Extract one frame and write it, or the reason why there is nothing to write.
+
+    Args:
+        keep_faults: False leaves a frame without a garment undone.
+    Returns:
+        Why there is no garment.
+    """
+    path = take.folder / "frames" / f"{frame_id:06d}.npz"
+    fault, found, estimated = None, None, False
+    with scan_looked_at(take.capture, frame_id) as looked:
+        try:
+            found, estimated = extract_frame(take.capture, take.colours, frame_id)
+        except InputError as error:
+            fault = error
+    said: dict[str, Any] = {ESTIMATED: True} if estimated else {}
+    if fault is not None:
+        if not keep_faults:
+            return fault
+        said = {"reason": str(fault)} | ({} if isinstance(fault, ColourNotFoundError) else {DAMAGED: True})
+
+    def write() -> None:
+        if found is None:
+            write_npz(path, reason=np.array(str(fault)))
+        else:
+            save_garment_scan(path, found, estimated=estimated)
+
+    inputs = {**take.inputs, "scan": scan_digest(looked)}
+    make(take.folder, path, write, inputs=inputs, files=looked, said=said)
+    return fault

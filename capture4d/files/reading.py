@@ -7,6 +7,7 @@ import errno
 import os
 import stat
 from collections.abc import Iterator
+from contextvars import ContextVar
 from os import PathLike, fspath
 from pathlib import Path, PurePath, PureWindowsPath
 
@@ -14,7 +15,7 @@ import numpy as np
 
 from capture4d.errors import InputError
 
-__all__ = ["ALLOW_OUTSIDE", "companion", "one_line", "reading", "require_file", "shortened"]
+__all__ = ["ALLOW_OUTSIDE", "companion", "companions_named", "one_line", "reading", "require_file", "shortened"]
 
 ALLOW_OUTSIDE = "CAPTURE4D_ALLOW_OUTSIDE"
 """Variable of the environment, which worker processes inherit."""
@@ -99,10 +100,27 @@ def companion(path: Path, name: str, what: str) -> Path:
             f"expected the {what} beside it or in a folder below, found {told}; --allow-outside reads it all the same",
             where=path,
         )
+    named = _named.get()
+    if named is not None:
+        named.add(found)
     require_file(found, what)
     if not found.is_file():
         raise InputError(f"no such file, the {what} of {path.name}", where=found)
     return found
+
+
+@contextlib.contextmanager
+def companions_named() -> Iterator[set[Path]]:
+    """The files that those which are read inside name and may read, whether or not they are there."""
+    named: set[Path] = set()
+    token = _named.set(named)
+    try:
+        yield named
+    finally:
+        _named.reset(token)
+
+
+_named: ContextVar[set[Path] | None] = ContextVar("companions that are named", default=None)
 
 
 def require_file(path: str | PathLike[str], kind: str) -> None:

@@ -85,7 +85,7 @@ def open_take(path: Path, claims: Claims | None = None) -> TakeFolder:
     except InputError as error:
         raise error.at(described) from None
     folder = path / "scans" if (path / "scans").is_dir() else path
-    found = list_scans(folder, claims.frames, companions_below=False)
+    found = list_scans(folder, claims.frames)
     if not found.scans:
         named = (
             f"named {claims.frames}" if claims.frames else f"with a frame number in their names ({', '.join(KINDS)})"

@@ -5,16 +5,14 @@ Stages that have a folder to themselves are those of `capture4d.runs.stage`; a r
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from capture4d.errors import StaleError
-from capture4d.files.atomic import file_digest, plain_value, write_json
-from capture4d.runs.stage import differences, read_record
+from capture4d.files.atomic import file_digest, write_json
+from capture4d.runs.stage import read_record, settings_of, unchanged_settings
 
 __all__ = ["FileStage", "open_file_stage"]
 
@@ -73,13 +71,12 @@ def open_file_stage(
         InputError: the record cannot be read.
         StaleError: the files were made with other settings.
     """
-    settings = {"stage": name, "schema": schema, "config": json.loads(json.dumps(config, default=plain_value))}
+    settings = settings_of(name, schema, config)
     earlier = read_record(record_path) if record_path.is_file() else None
     left = {} if earlier is None else earlier.get("files", {})
-    changed = [] if earlier is None else list(differences(settings, earlier))
-    if changed and not overwrite:
-        raise StaleError(f"was made with other settings ({'; '.join(changed[:3])}); use --overwrite", where=record_path)
-    if earlier is not None and (overwrite or changed or earlier.get("upstream") != dict(upstream)):
+    if earlier is not None and not overwrite:
+        unchanged_settings(settings, earlier, record_path)
+    if earlier is not None and (overwrite or earlier.get("upstream") != dict(upstream)):
         earlier = None
     places = {key: str(path.resolve()) for key, path in sources.items()}
     record = {**settings, "upstream": dict(upstream), "sources": places, "started": _now()}

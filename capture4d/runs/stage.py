@@ -11,17 +11,19 @@ import json
 import os
 import shutil
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from capture4d.errors import InputError, StaleError
 from capture4d.files.atomic import TEMPORARY_SUFFIX, file_digest, plain_value, read_json, write_json
 from capture4d.files.json_values import entry, text, whole
 from capture4d.files.reading import reading
+from capture4d.runs.changes import input_changes, setting_changes
+from capture4d.runs.decisions import DECISIONS
 from capture4d.runs.locks import LOCK
 
 __all__ = [
@@ -29,12 +31,17 @@ __all__ = [
     "Stage",
     "StageResult",
     "complete_record",
-    "differences",
+    "earlier_record",
     "open_stage",
+    "opened_record",
     "read_record",
     "require_complete",
     "result_of",
+    "settings_of",
+    "unchanged_settings",
 ]
+
+Opened = TypeVar("Opened", bound="Stage")
 
 FORMER_NAMES = {"wrinkles maps": "pairs", "wrinkles train": "train-wrinkles", "wrinkles apply": "wrinkles"}
 """Names that stages have had: a folder that bears one is read, and continued, as the stage's own."""
@@ -42,8 +49,8 @@ FORMER_STAGES = {former: name for name, former in FORMER_NAMES.items()}
 
 
 SCHEMAS = {
-    "animate": 1, "calibrate": 1, "compare": 5, "extract": 4, "fit": 5, "register": 3, "report": 3, "scan": 2,
-    "synth": 2, "synth-board": 1, "track": 4, "training-set": 1, "wrinkles apply": 2, "wrinkles maps": 1,
+    "animate": 1, "calibrate": 1, "compare": 5, "extract": 5, "fit": 5, "register": 4, "report": 3, "scan": 2,
+    "synth": 2, "synth-board": 1, "track": 5, "training-set": 1, "wrinkles apply": 2, "wrinkles maps": 1,
     "wrinkles offsets": 1, "wrinkles train": 1,
 }  # fmt: skip
 """Formats of the stages' outputs: a folder with a higher number comes from a later version."""
@@ -121,12 +128,19 @@ class Stage:
         if self._earlier is not None and not changed and all(path.is_file() for path in paths):
             write_json(self.path / "stage.json", {**self._earlier, "sources": self._record["sources"]})
             return result(digest=self._earlier["digest"])
-        for leftover in self.path.rglob(f".*{TEMPORARY_SUFFIX}"):
-            leftover.unlink(missing_ok=True)
-        digest = file_digest(paths, root=self.path)
-        finished = {**self._record, "status": "complete", "digest": digest, "finished": _now()}
-        write_json(self.path / "stage.json", finished)
-        return result(digest=digest)
+        return result(digest=self.finish_with(file_digest(paths, root=self.path)).digest)
+
+    def finish_with(self, digest: str) -> StageResult:
+        """Mark the stage complete, of a digest that is known."""
+        earlier = self._earlier or {}
+        same = earlier.get("digest") == digest
+        if not same:
+            for leftover in self.path.rglob(f".*{TEMPORARY_SUFFIX}"):
+                leftover.unlink(missing_ok=True)
+        finished = earlier.get("finished", _now()) if same else _now()
+        record = {**self._record, "status": "complete", "digest": digest, "finished": finished}
+        write_json(self.path / "stage.json", record)
+        return StageResult(self.path, digest)
 
 
 def open_stage(
@@ -137,7 +151,6 @@ def open_stage(
     config: Any,
     upstream: Mapping[str, str],
     sources: Mapping[str, Path] | None = None,
-    formerly: Mapping[str, str] | None = None,
     overwrite: bool = False,
 ) -> Stage:
     """Open an output folder, new or to be continued.
@@ -148,21 +161,45 @@ def open_stage(
         config: frozen dataclass of everything that decides the result (so not the number of workers).
         upstream: digest of each input, by name.
         sources: where the inputs lie, for later stages and for people. Inputs may be moved, so this decides nothing.
-        formerly: an earlier `upstream` whose results still hold; a folder that was made from it is taken over.
         overwrite: start clean; deletes everything in the folder, if it is this stage's.
     Raises:
         InputError: the folder holds something else.
         StaleError: it holds this stage, made with other settings or from other inputs.
     """
-    assert schema <= SCHEMAS.get(name, schema), f"SCHEMAS says less of {name}"
     folder = Path(folder)
+    settings = {**settings_of(name, schema, config), "upstream": dict(upstream)}
+    existing = earlier_record(folder, name, overwrite=overwrite)
+    if existing is not None:
+        unchanged_settings(settings, existing, folder)
+        changed = input_changes(settings["upstream"], existing.get("upstream", {}))
+        if changed:
+            raise StaleError(
+                f"was made from other inputs ({', '.join(changed[:3])}); with --overwrite the same command makes it "
+                "from those that are there now",
+                where=folder,
+            )
+    return opened_record(folder, settings, existing, sources or {})
+
+
+# --- the record of a folder --------------------------------------------------------------------------------------
+
+
+def settings_of(name: str, schema: int, config: Any) -> dict[str, Any]:
+    """What a record says of a stage's settings."""
+    assert schema <= SCHEMAS.get(name, schema), f"SCHEMAS says less of {name}"
+    return {"stage": name, "schema": schema, "config": json.loads(json.dumps(config, default=plain_value))}
+
+
+def earlier_record(folder: Path, name: str, *, overwrite: bool, discard: bool = True) -> dict[str, Any] | None:
+    """The record of a stage's earlier run in a folder; None if there was none, or it is to be deleted and now is.
+
+    Args:
+        overwrite: delete it, with all that it tells of.
+        discard: False deletes nothing, not even what was about to be.
+    Raises:
+        InputError: the folder holds something else.
+    """
     record_path = folder / "stage.json"
-    settings = {
-        "stage": name,
-        "schema": schema,
-        "config": json.loads(json.dumps(config, default=plain_value)),
-        "upstream": dict(upstream),
-    }
     if folder.exists() and not folder.is_dir():
         raise InputError("expected a folder to write to, found a file", where=folder)
     existing = read_record(record_path) if record_path.exists() else None
@@ -172,24 +209,52 @@ def open_stage(
         raise InputError(f"expected an empty folder or an earlier run of '{name}', found other files", where=folder)
     if existing is not None and existing.get("stage") != name:
         raise InputError(f"expected output of '{name}', found output of '{existing.get('stage')}'", where=folder)
-
     if existing is not None and (overwrite or existing.get("status") == "discarded"):
-        _discard(folder, existing)
-        existing = None
-    if existing is not None and formerly not in (None, upstream) and existing.get("upstream") == formerly:
-        existing = {**existing, "upstream": settings["upstream"], "status": "taken over"}
-    if existing is not None:
-        changed = list(differences(settings, existing))
-        if changed:
-            raise StaleError(f"was made with other settings ({'; '.join(changed[:3])}); use --overwrite", where=folder)
-        started = existing.get("started", _now())
-    else:
-        started = _now()
-    places = {name: str(path.resolve()) for name, path in (sources or {}).items()}
+        if discard:
+            _discard(folder, existing)
+        return None
+    return existing
+
+
+def unchanged_settings(settings: Mapping[str, Any], existing: Mapping[str, Any], folder: Path) -> None:
+    """Raises StaleError where a stage's folder was made with other settings, or in another format."""
+    if existing.get("schema") != settings["schema"]:
+        raise StaleError(
+            f"was made by an earlier version of capture4d, in format {existing.get('schema')}; with --overwrite the "
+            "same command makes it anew",
+            where=folder,
+        )
+    changed = setting_changes(settings["config"], existing.get("config") or {})
+    if changed:
+        more = f" and {len(changed) - 3} more" if len(changed) > 3 else ""
+        raise StaleError(
+            f"was made with other settings ({', '.join(changed[:3])}{more}); with --overwrite the same command makes "
+            "it anew, and keeps what it is made from",
+            where=folder,
+        )
+
+
+def opened_record(
+    folder: Path,
+    settings: Mapping[str, Any],
+    existing: Mapping[str, Any] | None,
+    sources: Mapping[str, Path],
+    *,
+    kind: Callable[[Path, dict[str, Any], dict[str, Any] | None], Opened] = Stage,
+) -> Opened:
+    """Write down what a folder is about to be made with, unless that is known.
+
+    Args:
+        kind: of stage to open: made of the folder, its record, and that of the run before if it is complete.
+    """
+    started = _now() if existing is None else existing.get("started", _now())
+    places = {name: str(path.resolve()) for name, path in sources.items()}
     record = {**settings, "sources": places, "status": "running", "started": started}
-    if existing is None or existing.get("status") != "running":
-        write_json(record_path, record)
-    return Stage(folder, record, existing if existing and existing.get("status") == "complete" else None)
+    same = existing is not None and all(existing.get(key) == value for key, value in settings.items())
+    if existing is None or existing.get("status") != "running" or not same:
+        write_json(folder / "stage.json", record)
+    complete = existing is not None and same and existing.get("status") == "complete"
+    return kind(folder, record, dict(existing) if existing is not None and complete else None)
 
 
 def result_of(folder: Path, output: Path | None = None) -> StageResult:
@@ -269,26 +334,12 @@ def read_record(path: Path) -> dict[str, Any]:
     return record
 
 
-def differences(now: Any, before: Any, prefix: str = "") -> Iterator[str]:
-    """What settings say now, and said before, one text for each that changed."""
-    for key in now:
-        label = f"{prefix}{key}"
-        new, old = now[key], before.get(key) if isinstance(before, dict) else None
-        if isinstance(new, dict) and isinstance(old, dict):
-            yield from differences({**dict.fromkeys(old), **new}, old, f"{label}.")
-        elif new != old:
-            yield f"{label}: was {_short(old)}, now {_short(new)}"
-
-
-def _short(value: Any) -> str:
-    text = json.dumps(value)
-    return text if len(text) <= 40 else f"{text[:36]}..."
-
-
 def _is_blank(folder: Path) -> bool:
-    """Nothing in it but folders and the temporary files of a run that was killed before its first file."""
+    """Nothing in it but folders, the temporary files of a run that was killed before its first file, and decisions that
+    were taken over from another take."""
+    ours = {LOCK, *(Path(place).name for places in DECISIONS.values() for place in places)}
     return not any(
-        path.is_file() and path.suffix != TEMPORARY_SUFFIX and path.name != LOCK for path in folder.rglob("*")
+        path.is_file() and path.suffix != TEMPORARY_SUFFIX and path.name not in ours for path in folder.rglob("*")
     )
 
 

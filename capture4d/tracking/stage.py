@@ -3,17 +3,21 @@
 stage.json               what was run
 body.npz                 the body that was tracked: the capture's, else the built-in one
 frames/000123.npz        first pass, forwards: where the next frame starts from
+shape.json               the shape of the take, which all frames have contributed to, and the frames it had then
 refined/000123.npz       second pass: rotations, translation, seen joints
 metrics/000123.json      verdict (good, check, lost), reasons, limbs that nobody scanned, numbers and CPU time
 poses.npz                the take's poses and shape, as a capture would bring them
 metrics.jsonl            the frames' metrics, one per line
+
+In the first pass a frame is made from its scan and the one or two that it starts from: what is changed there goes
+on to the frames after it, and what is added behind the last begins with it. In the second it is made from its scan,
+itself and its neighbours in the first, and the shape; so the shape, once it is found, stays until it is to be renewed.
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,85 +25,78 @@ from typing import Any
 import numpy as np
 
 from capture4d.body.anny import load_anny
-from capture4d.body.posed_surface import BodyState
-from capture4d.captures.capture import Capture, read_scan, scan_path
-from capture4d.captures.take_colours import KnownColours, take_colours
-from capture4d.errors import InputError
+from capture4d.captures.capture import Capture
+from capture4d.captures.scan_states import replaced_scan, require_same_take
+from capture4d.captures.take_colours import colours_of_take, kept_colours, take_colours
 from capture4d.files.arrays import ArrayFile
-from capture4d.files.atomic import (
-    file_digest,
-    nan_to_none,
-    read_json,
-    read_json_lines,
-    write_json,
-    write_json_lines,
-    write_npz,
-)
+from capture4d.files.atomic import read_json, read_json_lines, write_json_lines
 from capture4d.files.records import load_body, save_body, save_poses
-from capture4d.motions.motion_files import read_motion, told
-from capture4d.runs.stage import Stage, StageResult, open_stage
-from capture4d.runs.workers import progress, run_jobs
+from capture4d.runs.changes import StageChanges, say
+from capture4d.runs.frame_lists import listed
+from capture4d.runs.growing import GrowingStage, Pending, open_growing_stage, stage_changes
+from capture4d.runs.made import Ledger, digest_of
+from capture4d.runs.stage import StageResult
+from capture4d.runs.workers import run_jobs
 from capture4d.tracking.config import SequenceConfig, TrackingConfig
-from capture4d.tracking.limbs import guessed_limbs, unseen_limbs
-from capture4d.tracking.scan_points import ScanPoints, scan_points
-from capture4d.tracking.sequence import NOTHING, Followed, Quality, Refined, Tracker, between, outlying
+from capture4d.tracking.first_pass import follow_frames, require_found, standing_frames
+from capture4d.tracking.limbs import guessed_limbs
+from capture4d.tracking.second_pass import prepare_refining, refine_frame, refine_jobs
+from capture4d.tracking.sequence import outlying
+from capture4d.tracking.take import TakeShape, TrackedTake, kept_shape, reads_of, refined_paths, take_shape
 from capture4d.types import PoseSequence
 
-__all__ = ["run"]
+__all__ = ["changes", "run"]
 
-SCHEMA = 4
-
-
-STARTS = ("search", "rest")
+SCHEMA = 5
+NAME = "track"
 
 
 def run(
-    capture: Capture, output: Path, config: TrackingConfig, *, workers: int = 1, overwrite: bool = False
+    capture: Capture,
+    output: Path,
+    config: TrackingConfig,
+    *,
+    workers: int = 1,
+    overwrite: bool = False,
 ) -> StageResult:
     """Track the body through every frame.
 
     Raises:
         InputError: the capture is damaged, none of its scans can be read, or the start is no pose of its body.
     """
-    upstream = {"capture": capture.digest}
-    if capture.body_digest:
-        upstream["body"] = capture.body_digest
-    if config.start not in STARTS:
-        start_file = Path(config.start)
-        if not start_file.is_file():
-            raise InputError(f"start: expected {', '.join(STARTS)} or a motion file, found '{config.start}'")
-        upstream["start"] = file_digest([start_file], root=start_file.parent)
-    stage = open_stage(
+    if not overwrite:
+        require_same_take(output, capture)
+    stage = open_growing_stage(
         output,
-        name="track",
+        name=NAME,
         schema=SCHEMA,
         config=config,
-        upstream=upstream,
+        reads=reads_of(capture, config),
         sources={"capture": capture.path},
         overwrite=overwrite,
     )
-    if not (output / "body.npz").is_file():
-        save_body(output / "body.npz", capture.body or load_anny())
-    pending = stage.pending(capture.frame_ids)
-    to_refine = stage.pending(capture.frame_ids, folder="refined")
-    if pending or to_refine:
-        take = _Take(capture, stage, config, take_colours(capture))
-        if pending:
-            _follow_frames(take, pending)
-        _require_found(take)
-        shape = _take_shape(stage, capture.frame_ids)
-        jobs = [_RefineJob(frame_id, shape) for frame_id in to_refine]
-        prepare = partial(_prepare, take)
-        for _ in run_jobs(_refine_frame, jobs, prepare=prepare, workers=workers, label="refine poses"):
+    body_path = output / "body.npz"
+    stage.make_unless_standing(
+        body_path,
+        lambda: save_body(body_path, capture.body or load_anny()),
+        inputs={"body": capture.body_digest or "built-in"},
+    )
+    colours = colours_of_take(capture, output)
+    take = TrackedTake(capture, stage, config, colours.colours)
+    follow_frames(take)
+    require_found(take)
+    shape = take_shape(take)
+    kept = {"shape": shape.frames, "colours": "" if colours.newly else colours.frames}
+    jobs = refine_jobs(take, shape)
+    if jobs:
+        _say_kept(output.name, {what: frames for what, frames in kept.items() if frames}, capture.frame_ids)
+        prepare = partial(prepare_refining, take)
+        for _ in run_jobs(refine_frame, jobs, prepare=prepare, workers=workers, label="refine poses"):
             pass
-    gathered = all((output / name).is_file() for name in ("poses.npz", "metrics.jsonl"))
-    changed = bool(pending or to_refine) or not gathered or not stage.was_complete
-    if changed:
-        _gather(capture, stage, config)
-    refined = [stage.frame_path(frame_id, folder="refined") for frame_id in capture.frame_ids]
-    return stage.finish(
-        [output / "body.npz", output / "poses.npz", *refined],
-        changed=changed,
+        stage = stage.with_notes()
+    _gather(replace(take, stage=stage), shape)
+    return stage.finish_growing(
+        [body_path, output / "poses.npz", *refined_paths(take)],
         frames=len(capture.frame_ids),
         failed={
             record["frame_id"]: "; ".join(record["reasons"])
@@ -109,203 +106,47 @@ def run(
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Take:
-    """What both passes work on."""
+def changes(capture: Capture, output: Path, config: TrackingConfig) -> StageChanges:
+    """What `run` would do, and why; nothing is done."""
 
-    capture: Capture
-    stage: Stage
-    config: TrackingConfig
-    colours: KnownColours
-
-    def tracker(self) -> Tracker:
-        return Tracker.create(load_body(self.stage.path / "body.npz"), self.config)
-
-    def points(self, frame_id: int) -> tuple[ScanPoints, str]:
-        """Points of a scan, and what is wrong with it: none where it cannot be read, which loses the frame."""
-        colours = self.colours
-        try:
-            scan = colours.flat(read_scan(self.capture, frame_id))
-            paints = tuple(dict.fromkeys(colours.boundary.values()))
-            source = str(scan_path(self.capture, frame_id))
-            return scan_points(scan, colours.garment, paints, self.config.sampling, source=source), ""
-        except InputError as error:
-            return ScanPoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, bool)), str(error)
-
-
-# --- first pass --------------------------------------------------------------------------------------------------
-
-
-def _follow_frames(take: _Take, frame_ids: Sequence[int]) -> None:
-    """One frame after the other, from where an earlier run stopped."""
-    capture, stage, config = take.capture, take.stage, take.config
-    tracker, pending = take.tracker(), set(frame_ids)
-    last = before = None
-    with progress("track body", len(capture.frame_ids), completed=len(capture.frame_ids) - len(pending)) as advance:
-        for frame_id in capture.frame_ids:
-            path = stage.frame_path(frame_id)
-            if frame_id in pending:
-                begin = time.process_time()
-                points, fault = take.points(frame_id)
-                if last is not None:
-                    followed = tracker.follow(points, last, before)
-                elif fault:
-                    followed = tracker.nothing(points)
-                else:
-                    followed = tracker.begin(points, _start(tracker, config, frame_id))
-                _save_followed(path, followed, time.process_time() - begin)
-                advance(1)
-            followed = _load_followed(path)
-            if followed.started_from == NOTHING:
-                continue
-            before = last if followed.lost_frames == 0 and last is not None and last.lost_frames == 0 else None
-            last = followed
-
-
-def _require_found(take: _Take) -> None:
-    """See that the first pass had a scan to start from, in this run or an earlier one.
-
-    Raises:
-        InputError: no scan can be read; about the first.
-    """
-    frame_ids, stage = take.capture.frame_ids, take.stage
-    if all(_load_followed(stage.frame_path(frame_id)).started_from == NOTHING for frame_id in frame_ids):
-        raise InputError(take.points(frame_ids[0])[1])
-
-
-def _start(tracker: Tracker, config: TrackingConfig, frame_id: int) -> BodyState | None:
-    if config.start == "search":
-        return None
-    rest = tracker.model.rest_state()
-    if config.start == "rest":
-        return rest
-    start = Path(config.start)
-    poses = read_motion(start, tracker.model.body, say=told(start))
-    row = poses.row(frame_id) if frame_id in poses.frame_ids else 0
-    shape = np.zeros_like(rest.shape)
-    shape[: len(poses.shape)] = poses.shape[: len(shape)]
-    return BodyState(poses.rotations[row].astype(np.float64), poses.translations[row].astype(np.float64), shape)
-
-
-def _save_followed(path: Path, followed: Followed, cpu_s: float) -> None:
-    """The time first: the frame counts as done once its npz is there."""
-    write_json(path.parents[1] / "times" / f"{path.stem}.json", {"cpu_s": round(cpu_s, 4)})
-    write_npz(
-        path,
-        rotations=followed.state.rotations,
-        translation=followed.state.translation,
-        shape=followed.state.shape,
-        shape_information=followed.shape_information,
-        reasons=np.array(followed.quality.reasons, np.str_),
-        numbers=np.array([followed.quality.lost, *_numbers(followed.quality).values()], np.float64),
-        started_from=np.array(followed.started_from),
-        lost_frames=followed.lost_frames,
-        doubtful_frames=followed.doubtful_frames,
-    )
-
-
-def _load_followed(path: Path) -> Followed:
-    with ArrayFile(path) as arrays:
-        lost, explained, median_m, inside = arrays["numbers"]
-        return Followed(
-            BodyState(arrays["rotations"], arrays["translation"], arrays["shape"]),
-            arrays["shape_information"],
-            Quality(arrays.names("reasons"), bool(lost), float(explained), float(median_m), float(inside)),
-            str(arrays["started_from"]),
-            int(arrays["lost_frames"]),
-            int(arrays["doubtful_frames"]),
+    def pending(ledger: Ledger) -> Pending:
+        kept = None if capture.garment_colour is not None else kept_colours(capture, output)
+        if capture.garment_colour is None and kept is None:
+            return Pending(capture.frame_ids)
+        stage = GrowingStage(output, {}, ledger=ledger)
+        take = TrackedTake(capture, stage, config, take_colours(capture) if kept is None else kept.colours)
+        if not (output / "body.npz").is_file() or ledger.of(output / "body.npz") is None:
+            return Pending(capture.frame_ids)
+        shape = kept_shape(take)
+        return _pending(take, shape).keeping(
+            *([f"shape, found from frames {shape.frames}"] if shape else []),
+            *([f"colours, learned from frames {kept.frames}"] if kept else []),
         )
 
-
-def _numbers(quality: Quality) -> Mapping[str, float]:
-    return {"explained": quality.explained, "median_m": quality.median_m, "inside": quality.inside}
-
-
-def _take_shape(stage: Stage, frame_ids: tuple[int, ...]) -> tuple[float, ...]:
-    """The shape after the last frame, which all frames have contributed to."""
-    return tuple(float(value) for value in _load_followed(stage.frame_path(frame_ids[-1])).state.shape)
-
-
-# --- second pass -------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class _RefineJob:
-    frame_id: int
-    shape: tuple[float, ...]
-
-
-def _prepare(take: _Take) -> tuple[_Take, Tracker]:
-    return take, take.tracker()
-
-
-def _refine_frame(prepared: tuple[_Take, Tracker], job: _RefineJob) -> None:
-    take, tracker = prepared
-    capture, stage = take.capture, take.stage
-    begin = time.process_time()
-    first, start, around = _surroundings(capture, stage, job.frame_id)
-    start = replace(start, shape=np.array(job.shape))
-    points, fault = take.points(job.frame_id)
-    refined = tracker.refine(points, start, around, interval_s=1 / capture.fps, lost=first.quality.lost)
-    if fault:
-        refined = replace(refined, quality=replace(refined.quality, reasons=(fault,)))
-    unseen = unseen_limbs(tracker.model.body.joint_names, refined.seen)
-    _save_refined(stage, job.frame_id, first, refined, unseen, time.process_time() - begin)
-
-
-def _surroundings(capture: Capture, stage: Stage, frame_id: int) -> tuple[Followed, BodyState, list[BodyState]]:
-    """A frame after the first pass, where its second starts, and its neighbours if they are next to it and good."""
-    ids = capture.frame_ids
-    position = ids.index(frame_id)
-    own = _load_followed(stage.frame_path(frame_id))
-
-    def good(step: int) -> tuple[int, Followed] | None:
-        """The nearest frame on one side that is not lost."""
-        at = position + step
-        while 0 <= at < len(ids):
-            found = _load_followed(stage.frame_path(ids[at]))
-            if not found.quality.lost:
-                return ids[at], found
-            at += step
-        return None
-
-    back, ahead = good(-1), good(1)
-    if own.quality.lost:
-        if back and ahead:
-            share = (frame_id - back[0]) / (ahead[0] - back[0])
-            return own, between(back[1].state, ahead[1].state, share), []
-        near = back or ahead
-        return own, near[1].state if near else own.state, []
-    if back and ahead and back[0] == frame_id - 1 and ahead[0] == frame_id + 1:
-        return own, own.state, [back[1].state, ahead[1].state]
-    return own, own.state, []
-
-
-def _save_refined(
-    stage: Stage, frame_id: int, first: Followed, refined: Refined, unseen: tuple[str, ...], cpu_s: float
-) -> None:
-    """Metrics first: the frame counts as done once its npz is there."""
-    quality = refined.quality
-    numbers = nan_to_none(_numbers(quality))
-    before = read_json(stage.path / "times" / f"{frame_id:06d}.json")["cpu_s"]
-    write_json(
-        stage.frame_path(frame_id, ".json", folder="metrics"),
-        {
-            "frame_id": frame_id,
-            "verdict": "lost" if quality.lost else "check" if quality.reasons else "good",
-            "reasons": list(quality.reasons),
-            "unseen": list(unseen),
-            **numbers,
-            "started_from": first.started_from,
-            "cpu_s": round(before + cpu_s, 4),
-        },
+    return stage_changes(
+        output, name=NAME, schema=SCHEMA, config=config, reads=reads_of(capture, config), pending=pending
     )
-    write_npz(
-        stage.frame_path(frame_id, folder="refined"),
-        rotations=refined.state.rotations.astype(np.float32),
-        translation=refined.state.translation.astype(np.float32),
-        seen=refined.seen,
-    )
+
+
+def _pending(take: TrackedTake, shape: TakeShape | None) -> Pending:
+    """Frames that are to be tracked."""
+    capture, ledger, settings = take.capture, take.stage.ledger, take.settings_digest()
+    frame_ids, stage = capture.frame_ids, take.stage
+    replaced = [each for each in frame_ids if replaced_scan(ledger, stage.frame_path(each), capture, each)]
+    _, at = standing_frames(take, settings)
+    if at == len(frame_ids):
+        again = frame_ids if shape is None else tuple(job.frame_id for job in refine_jobs(take, shape))
+        return Pending(again, replaced=tuple(replaced))
+    certain = {frame_ids[at], *replaced, *(each for each in frame_ids if ledger.sound(stage.frame_path(each)) is None)}
+    following = tuple(each for each in frame_ids[at:] if each not in certain)
+    return Pending(tuple(sorted(certain)), following, tuple(replaced))
+
+
+def _say_kept(name: str, kept: Mapping[str, str], frame_ids: Sequence[int]) -> None:
+    now = listed(frame_ids, most=0)
+    for what, frames in kept.items():
+        if frames != now:
+            say(f"{name}: the {what} of the take stays as frames {frames} gave it; --renew {what} finds it anew")
 
 
 def _with_take(records: Sequence[dict[str, Any]], config: SequenceConfig) -> list[dict[str, Any]]:
@@ -329,26 +170,37 @@ def _with_take(records: Sequence[dict[str, Any]], config: SequenceConfig) -> lis
     return flagged
 
 
-def _gather(capture: Capture, stage: Stage, config: TrackingConfig) -> None:
+def _gather(take: TrackedTake, shape: TakeShape) -> None:
     """Poses and metrics of all frames."""
-    shape = _take_shape(stage, capture.frame_ids)
-    paths = [stage.frame_path(frame_id, folder="refined") for frame_id in capture.frame_ids]
+    stage, capture = take.stage, take.capture
+    refined = stage.digest_of_all(refined_paths(take))
+    followed = stage.digest_of_all([stage.frame_path(frame_id) for frame_id in capture.frame_ids])
+    poses, metrics = stage.path / "poses.npz", stage.path / "metrics.jsonl"
+    shared = {"refined": refined, "settings": digest_of([take.settings_digest(), shape.coefficients, capture.fps])}
+    stage.make_unless_standing(poses, lambda: _save_poses(take, shape, poses), inputs=shared)
+    stage.make_unless_standing(metrics, lambda: _save_metrics(take, metrics), inputs={**shared, "followed": followed})
+
+
+def _save_poses(take: TrackedTake, shape: TakeShape, path: Path) -> None:
     rotations, translations = [], []
-    for path in paths:
-        with ArrayFile(path) as arrays:
+    for each in refined_paths(take):
+        with ArrayFile(each) as arrays:
             rotations.append(arrays["rotations"])
             translations.append(arrays["translation"])
-    names = load_body(stage.path / "body.npz").joint_names
+    names = load_body(take.stage.path / "body.npz").joint_names
     save_poses(
-        stage.path / "poses.npz",
+        path,
         PoseSequence(
             np.stack(rotations),
             np.stack(translations),
-            np.array(shape, np.float32),
-            np.array(capture.frame_ids, np.int32),
-            capture.fps,
+            np.array(shape.coefficients, np.float32),
+            np.array(take.capture.frame_ids, np.int32),
+            take.capture.fps,
             names,
         ),
     )
-    records = [read_json(stage.frame_path(frame_id, ".json", folder="metrics")) for frame_id in capture.frame_ids]
-    write_json_lines(stage.path / "metrics.jsonl", _with_take(records, config.sequence))
+
+
+def _save_metrics(take: TrackedTake, path: Path) -> None:
+    paths = (take.stage.frame_path(frame_id, ".json", folder="metrics") for frame_id in take.capture.frame_ids)
+    write_json_lines(path, _with_take([read_json(each) for each in paths], take.config.sequence))

@@ -24,7 +24,7 @@ from capture4d.app.report.metrics import column, shown
 from capture4d.body.skinning import ShapedBody, pose_frame, with_shape
 from capture4d.captures.capture import Capture
 from capture4d.captures.garment_scans import load_garment_scan
-from capture4d.captures.take_colours import KnownColours, take_colours
+from capture4d.captures.take_colours import COLOURS, KnownColours, read_colours, take_colours
 from capture4d.captures.work_folder import WorkFolder, load_tracking
 from capture4d.colours.labels import classify_colours, settle_labels
 from capture4d.errors import InputError
@@ -237,9 +237,9 @@ class StagePictures:
 def draw_stages(work: WorkFolder, capture: Capture, rows: Sequence[int], *, workers: int) -> list[StagePictures]:
     """What was cut out and what was tracked, in the frames at these positions."""
     loops = {int(row): _loop_places(work.registered, row) for row in rows}
-    extraction = work.path / "garment" / "colours.json"
-    learned = extraction.is_file() and bool(read_json(extraction)["learned"])
-    prepare = partial(_Drawing.open, work.path, capture, take_colours(capture, learn=learned), loops)
+    extraction = work.path / "garment" / COLOURS
+    colours = read_colours(extraction) if extraction.is_file() else take_colours(capture)
+    prepare = partial(_Drawing.open, work.path, capture, colours, loops)
     found = run_jobs(_draw_row, list(rows), prepare=prepare, workers=workers, label="draw stages")
     return sorted(found, key=lambda each: each.row)
 

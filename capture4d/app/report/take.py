@@ -10,7 +10,7 @@ import contextlib
 import math
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
 from itertools import groupby
@@ -133,7 +133,8 @@ def run(
         return result_of(folder, folder / "index.html")
     stale = (folder / "stage.json").exists()
     stage = open_stage(folder, name="report", schema=SCHEMA, config=config, upstream=upstream, overwrite=stale)
-    scene = _Scene(work, capture or read_capture(place))
+    frame_ids = tuple(work.registered.frame_ids.tolist())  # those that were asked for
+    scene = _Scene(work, replace(capture or read_capture(place), frame_ids=frame_ids))
     records = [dict(record) for record in work.records]
     _measure_truth(scene, records, config, workers)
     tracked = tracking(scene.capture, work.path)

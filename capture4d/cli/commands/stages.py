@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, UseAppendAction, arg
 
 from capture4d.cli.exit_codes import BAD_RESULT, GOOD
-from capture4d.cli.options import GradedOptions, MeshOptions, StageOptions
+from capture4d.cli.options import DecidingOptions, GradedOptions, MeshOptions, StageOptions, TakeOptions
 from capture4d.tracking.config import TrackingConfig
 from registration.config import RegistrationConfig
 
@@ -18,7 +18,7 @@ __all__ = ["Extract", "Register", "Report", "Run", "Track"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Extract(StageOptions, MeshOptions):
+class Extract(DecidingOptions, StageOptions, MeshOptions):
     """Cut the garment out of every scan by its colour, and find its painted borders."""
 
     capture: Annotated[Positional[Path], arg(metavar="CAPTURE")]
@@ -32,8 +32,10 @@ class Extract(StageOptions, MeshOptions):
     def __call__(self) -> int:
         from capture4d import pipeline
 
+        taken = self.taken(self.capture)
+        self.renewed(self.output)
         result = pipeline.extract(
-            self.capture,
+            taken,
             self.output,
             learn_colours=self.learn_colours,
             workers=self.workers,
@@ -49,7 +51,7 @@ class Extract(StageOptions, MeshOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Track(StageOptions, MeshOptions):
+class Track(DecidingOptions, StageOptions, MeshOptions):
     """Track the body through every scan: its poses, and one shape for the take."""
 
     capture: Annotated[Positional[Path], arg(metavar="CAPTURE")]
@@ -61,7 +63,9 @@ class Track(StageOptions, MeshOptions):
     def __call__(self) -> int:
         from capture4d import pipeline
 
-        result = pipeline.track(self.capture, self.output, self.config, workers=self.workers, overwrite=self.overwrite)
+        taken = self.taken(self.capture)
+        self.renewed(self.output)
+        result = pipeline.track(taken, self.output, self.config, workers=self.workers, overwrite=self.overwrite)
         if result.failed:
             frame_id, reason = next(iter(result.failed.items()))
             print(f"capture4d: lost in {len(result.failed)} frames, first in {frame_id}: {reason}", file=sys.stderr)
@@ -70,7 +74,7 @@ class Track(StageOptions, MeshOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Register(GradedOptions, MeshOptions):
+class Register(TakeOptions, GradedOptions, MeshOptions):
     """Register the template to every frame whose garment `extract` has cut out."""
 
     capture: Annotated[Positional[Path], arg(metavar="CAPTURE")]
@@ -87,7 +91,7 @@ class Register(GradedOptions, MeshOptions):
         from capture4d import pipeline
 
         result = pipeline.register(
-            self.capture,
+            self.taken(self.capture),
             self.output,
             self.config,
             tracked=self.tracked,
@@ -99,7 +103,7 @@ class Register(GradedOptions, MeshOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Run(GradedOptions, MeshOptions):
+class Run(DecidingOptions, GradedOptions, MeshOptions):
     """Run every stage on a capture: extract, track if it brings no poses, register, report."""
 
     capture: Annotated[Positional[Path], arg(metavar="CAPTURE")]
@@ -116,8 +120,10 @@ class Run(GradedOptions, MeshOptions):
     def __call__(self) -> int:
         from capture4d import pipeline
 
+        taken = self.taken(self.capture)
+        self.renewed(self.output)
         result = pipeline.run(
-            self.capture,
+            taken,
             self.output,
             self.config,
             tracking=self.tracking,

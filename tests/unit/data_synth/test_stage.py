@@ -72,7 +72,7 @@ def test_a_motion_file_is_part_of_what_a_take_is_made_of(tmp_path: Path) -> None
     open_take(tmp_path / "take", config)
     open_take(tmp_path / "take", config)
     motion.write_text("HIERARCHY of today")
-    with pytest.raises(InputError, match=r"made with other settings \(upstream\.bvh"):
+    with pytest.raises(InputError, match=r"made from other inputs \(bvh"):
         open_take(tmp_path / "take", config)
     open_take(tmp_path / "take", config, overwrite=True)
 

@@ -10,7 +10,7 @@ from capture4d.body.skinning import pose_frame, skin
 from capture4d.errors import InputError
 from capture4d.types import Body, Garment, Mesh, PoseSequence
 from registration.config import SequenceConfig
-from registration.predictions import Mover, blend, choose, misfit, predict
+from registration.predictions import Mover, bend_deg, blend, choose, misfit, predict
 from registration.register import prepare_frame
 from registration.sequence import register_run, segments
 from registration.template import analyse_template
@@ -73,7 +73,7 @@ def load(scan_of, body, poses):
     return set_up
 
 
-def go(analysis, mover, load, config, done=lambda frame_id: None):
+def go(analysis, mover, load, config, done=lambda position, before: None):
     frame_ids = tuple(range(0, 10 * FRAMES, 10))
     return list(register_run(analysis, mover, range(FRAMES), frame_ids, load=load, done=done, config=config))
 
@@ -93,8 +93,7 @@ def test_joints_must_agree(bound, body, poses, config) -> None:
 
 def test_without_poses_there_is_one_segment(bound, body, poses, config) -> None:
     assert segments(None, 500, SequenceConfig(segment=10)) == [range(500)]
-    mover = Mover.create(analyse_template(bound, config), body, poses)
-    assert segments(mover, FRAMES, SequenceConfig(segment=100)) == [range(FRAMES)]
+    assert segments(bend_deg(bound.skin_weights, poses), FRAMES, SequenceConfig(segment=100)) == [range(FRAMES)]
 
 
 def test_segments_start_near_the_rest_pose(bound, body, poses, config) -> None:
@@ -103,8 +102,7 @@ def test_segments_start_near_the_rest_pose(bound, body, poses, config) -> None:
         poses, rotations=poses.rotations[there_and_back], translations=np.zeros((4 * FRAMES, 3), np.float32),
         frame_ids=np.arange(4 * FRAMES, dtype=np.int32),
     )  # fmt: skip
-    mover = Mover.create(analyse_template(bound, config), body, long)
-    cut = segments(mover, 4 * FRAMES, SequenceConfig(segment=8, keyframe_bend_deg=1.0))
+    cut = segments(bend_deg(bound.skin_weights, long), 4 * FRAMES, SequenceConfig(segment=8, keyframe_bend_deg=1.0))
     assert [part.start for part in cut] == [0, 2 * FRAMES - 1]
     assert cut[-1].stop == 4 * FRAMES
 
@@ -141,8 +139,9 @@ def test_resuming_gives_the_same_bits(bound, body, poses, config, load) -> None:
     analysis = analyse_template(bound, config)
     mover, read = Mover.create(analysis, body, poses), load(analysis)
     whole = go(analysis, mover, read, config)
-    earlier = {result.frame_id: (result.vertices, True) for result in whole[:3]}
-    rest = go(analysis, mover, read, config, done=earlier.get)
+    earlier = {(result.position, result.before): (result.vertices, True) for result in whole[:3]}
+    assert list(earlier) == [(0, None), (1, 0), (2, 1)]
+    rest = go(analysis, mover, read, config, done=lambda *at: earlier.get(at))
     assert [result.frame_id for result in rest] == [30, 40, 50]
     for first, second in zip(whole[3:], rest, strict=True):
         np.testing.assert_array_equal(first.vertices, second.vertices)

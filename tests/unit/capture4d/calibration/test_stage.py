@@ -155,8 +155,8 @@ def test_a_rig_of_other_settings_is_not_replaced_unasked(shoot, tmp_path: Path, 
     other = ("--hold-out", "0", "--no-flatness")
     said = fails(capsys, *calibrate(folder / "images", rig, *other))
     assert said == (
-        f"{tmp_path / 'calibration_stage.json'}: was made with other settings "
-        "(config.hold_out: was 0.15, now 0.0; config.flatness: was true, now false); use --overwrite"
+        f"{tmp_path / 'calibration_stage.json'}: was made with other settings (hold_out 0.15 to 0.0, flatness true to "
+        "false); with --overwrite the same command makes it anew, and keeps what it is made from"
     )
     assert rig.read_bytes() == before
     assert run(*calibrate(folder / "images", rig, *other, "--overwrite")) == 0

@@ -12,10 +12,8 @@ import pytest
 from benchmarks.simulated_views import calibration_rig
 from capture4d.captures.capture import (
     Capture,
-    capture_digest,
     read_capture,
     read_scan,
-    scan_digest,
     scan_path,
     write_capture_description,
     write_scan,
@@ -136,11 +134,28 @@ def test_a_capture_is_as_it_was_when_it_was_opened(capture: Capture):
     save_poses(capture.path / "poses.npz", poses_of(FRAMES))
     opened = read_capture(capture.path)
     assert opened.poses is opened.poses
-    digest = opened.digest
     (capture.path / "capture.json").write_text("{}")
-    assert (opened.digest, capture_digest(opened)) == (digest, digest)
     travelled = pickle.loads(pickle.dumps(opened))
-    assert (travelled.digest, travelled.frame_ids) == (digest, FRAMES)
+    assert (travelled.frame_ids, travelled.entries("fps"), scan_path(travelled, 12).name) == (
+        FRAMES, {"fps": 60.0}, "000012.ply"
+    )  # fmt: skip
+
+
+def test_frames_of_a_capture_are_chosen_and_the_others_are_not_forgotten(capture: Capture):
+    chosen = read_capture(capture.path).choosing("11,13-20")
+    assert (chosen.frame_ids, chosen.left_out) == ((11, 15), (12,))
+    assert chosen.choosing("15").left_out == (11, 12)
+    assert capture.choosing(None) is capture
+    with pytest.raises(InputError, match=r"--frames: expected frames that the take has \(11-12,15\), found '13'"):
+        capture.choosing("11,13")
+
+
+def test_what_capture_json_says_is_told_by_entry(capture: Capture):
+    two = replace(capture, boundary_colours={"neck": (255, 210, 0), "hem": (255, 210, 0)}, garment_colour=None)
+    assert two.entries("units", "garment_colour", "boundary_colours", "paints") == {
+        "units": "m", "garment_colour": None, "boundary_colours": {"neck": "#ffd200", "hem": "#ffd200"},
+        "paints": ["#ffd200"],
+    }  # fmt: skip
 
 
 def test_of_two_files_of_a_frame_the_ply_counts(capture: Capture):
@@ -171,37 +186,6 @@ def test_poses_that_do_not_match_the_scans_are_named(capture: Capture):
     save_poses(capture.path / "poses.npz", poses_of((11, 12, 13)))
     with pytest.raises(InputError, match=r"poses\.npz: expected a pose for each of 3 scans.*frame 15 first"):
         _ = capture.poses
-
-
-def test_the_digest_of_a_capture_follows_its_scans_and_its_description(capture: Capture):
-    digests = [capture_digest(capture)]
-    assert capture_digest(read_capture(capture.path)) == digests[0]
-    for name in ("poses.npz", "body.npz", "template.npz", "template.obj"):  # of registration, not of extraction
-        (capture.path / name).write_bytes(b"1")
-    assert capture_digest(capture) == digests[0]
-    path = capture.path / "scans" / "000012.ply"
-    path.write_bytes(path.read_bytes() + b" ")
-    digests.append(capture_digest(capture))
-    path.write_bytes(path.read_bytes()[:-1] + b"x")  # of the same size
-    digests.append(capture_digest(capture))
-    for text in ("map_Kd a.png", "map_Kd b.png"):
-        (capture.path / "scans" / "000012.mtl").write_text(text)
-        digests.append(capture_digest(capture))
-    (capture.path / "scans" / "Thumbs.db").write_text("nobody's business")
-    assert capture_digest(capture) == digests[-1]
-    write_capture_description(replace(capture, fps=30.0))
-    digests.append(capture_digest(capture))
-    assert len(set(digests)) == len(digests)
-
-
-@pytest.mark.parametrize("size", [0, 1, 65_536, 65_537, 131_072, 131_073, 200_000])
-def test_the_digest_of_a_scan_follows_its_ends(size: int, tmp_path: Path):
-    path, data = tmp_path / "000001.ply", bytes(size)
-    path.write_bytes(data)
-    digest = scan_digest(path)
-    for place in {0, size - 1} if size else {}:
-        path.write_bytes(data[:place] + b"x" + data[place + 1 :])
-        assert scan_digest(path) != digest
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".obj", ".ply", ".glb"])

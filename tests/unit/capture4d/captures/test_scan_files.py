@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture4d.captures.capture import Capture, capture_digest, read_capture, read_frame, scan_path
+from capture4d.captures.capture import Capture, read_capture, read_frame, scan_path
 from capture4d.captures.scan_files import KINDS, frame_numbers, list_scans, read_surface
 from capture4d.errors import InputError
 from capture4d.files.atomic import write_json
@@ -101,19 +101,6 @@ def test_folders_pipes_and_broken_links_are_no_scans(tmp_path: Path):
     assert list(list_scans(folder / "scans").scans) == [1]
     with pytest.raises(InputError, match=r"scans: expected scans with a frame number in their names .*found none"):
         read_capture(capture_with(tmp_path / "other"))
-
-
-def test_the_digest_follows_textures_where_they_lie(tmp_path: Path):
-    folder = capture_with(
-        tmp_path, "1.gltf", "1.bin", "textures/a/skin.png", "textures/skin.WEBP", "textures/.hidden.png"
-    )
-    digests = [capture_digest(read_capture(folder))]
-    for name in ("1.bin", "textures/a/skin.png", "textures/skin.WEBP"):
-        (folder / "scans" / name).write_bytes(b"another")
-        digests.append(capture_digest(read_capture(folder)))
-    assert len(set(digests)) == len(digests)
-    (folder / "scans" / "textures" / ".hidden.png").write_bytes(b"another")
-    assert capture_digest(read_capture(folder)) == digests[-1]
 
 
 def test_a_capture_made_in_python_finds_its_scans(tmp_path: Path):

@@ -221,7 +221,9 @@ def test_a_repaired_scan_is_read_by_the_same_command(
     assert done.stat().st_mtime_ns == before
     scan = tube_capture / "scans" / "000005.ply"
     scan.write_bytes(scan.read_bytes() + b"0")
-    assert "use --overwrite" in fails(capsys, *extract(tube_capture, work)), "this one was read"
+    assert run(*extract(tube_capture, work)) == 0
+    assert "garment: frame 5 replaced" in capsys.readouterr().err
+    assert done.stat().st_mtime_ns != before
 
 
 def test_what_registration_starts_from_is_what_it_was(
@@ -231,21 +233,46 @@ def test_what_registration_starts_from_is_what_it_was(
     assert run(*extract(tube_capture, work)) == 0
     other = shutil.copytree(tube_capture, tmp_path / "other")
     description = json.loads((other / "capture.json").read_text())
-    write_json(other / "capture.json", {**description, "fps": 30.0})
+    write_json(other / "capture.json", {**description, "garment_colour": "#2f62ca"})
     said = fails(capsys, "register", other, "--output", work)
-    assert "expected the output of 'extract' from this capture as it is now" in said
-    assert said.endswith(f"run: capture4d extract {other} --output {work} --overwrite")
+    assert "'extract' is of the take as it was before (garment colour #2f62c9 to #2f62ca)" in said
+    assert said.endswith(f"run: capture4d extract {other} --output {work}")
+    write_json(other / "capture.json", {**description, "fps": 30.0})
+    assert run("register", other, "--output", work, "--workers", "1") == 0, "no stage of these reads the frame rate"
 
+    frames = work / "registration" / "frames"
     assert run(*register) == 0
+    before = {path: path.stat().st_mtime_ns for path in frames.iterdir()}
     template = load_garment(tube_capture / "template.npz")
     moved = template.template.with_vertices(template.template.vertices + np.float32(0.001))
     save_garment(tube_capture / "template.npz", replace(template, template=moved))
-    assert "upstream.template" in fails(capsys, *register)
-    save_garment(tube_capture / "template.npz", template)
+    capsys.readouterr()
     assert run(*register) == 0
+    assert "registration: template changed" in capsys.readouterr().err
+    after = {path: path.stat().st_mtime_ns for path in frames.iterdir()}
+    assert all(before[path] != after[path] for path in before)
     save_poses(tube_capture / "poses.npz", still_poses((5, 6, 7)))
     assert run(*extract(tube_capture, work)) == 0, "poses do not concern it"
-    assert "upstream.motion" in fails(capsys, *register)
+    assert run(*register) == 0
+    assert "registration: motion added" in capsys.readouterr().err
+    assert {path: path.stat().st_mtime_ns for path in frames.iterdir()} == after, "nor a template without weights"
+
+
+def test_another_take_is_not_taken_for_one_that_has_changed(
+    tube_capture: Path, work: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    assert run(*extract(tube_capture, work)) == 0
+    other = shutil.copytree(tube_capture, tmp_path / "other")
+    assert run(*extract(other, work)) == 0, "the same take elsewhere"
+    assert run(*extract(tube_capture, work)) == 0
+    for path in (other / "scans").iterdir():
+        path.write_bytes(path.read_bytes() + b"0")
+    said = fails(capsys, *extract(other, work))
+    assert said == (
+        f"{work / 'garment'}: was made from another take, {tube_capture.resolve()}: none of its scans is the same; "
+        "give another --output, or --overwrite"
+    )
+    assert run(*extract(other, work), "--overwrite") == 0
 
 
 def test_a_run_without_a_template_ends_before_it_begins(
@@ -299,7 +326,7 @@ def test_other_settings_are_refused_and_overwrite_starts_clean(
     stacked = (work / "registration" / "vertices.npy").read_bytes()
 
     said = fails(capsys, *register, "--graph.nodes", "77")
-    assert "config.graph.nodes: was 300, now 77" in said
+    assert "was made with other settings (nodes 300 to 77); with --overwrite the same command makes it anew" in said
     assert "--overwrite" in said
     assert (work / "registration" / "vertices.npy").read_bytes() == stacked
     assert run(*register, "--graph.nodes", "77", "--overwrite") == 0

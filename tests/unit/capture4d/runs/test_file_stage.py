@@ -73,7 +73,7 @@ def test_other_inputs_are_taken_without_a_question(files: list[Path]) -> None:
 
 def test_other_settings_are_refused_unless_told(files: list[Path]) -> None:
     folder = files[0].parent
-    with pytest.raises(StaleError, match=r"record\.json: was made with other settings \(config\.fine: was 3, now 4\)"):
+    with pytest.raises(StaleError, match=r"record\.json: was made with other settings \(fine 3 to 4\)"):
         opened(folder, fine=4)
     stage = opened(folder, fine=4, overwrite=True)
     assert stage.made(files) is None

@@ -154,23 +154,6 @@ def test_a_stage_made_from_something_else_names_the_repair(tmp_path: Path):
         require_complete(tmp_path, "test", "make", made_from={"garment": "bb"})
 
 
-def test_a_stage_is_taken_over_by_inputs_that_stand_for_its_own(tmp_path: Path):
-    finish_frames(open_test_stage(tmp_path, garment="aa"))
-
-    def opened(now: str, formerly: str) -> Stage:
-        return open_stage(tmp_path, name="test", schema=1, config=Settings(), upstream={"garment": now},
-                          formerly={"garment": formerly})  # fmt: skip
-
-    with pytest.raises(InputError, match=r"upstream\.garment"):
-        opened("bb", "cc")
-    stage = opened("bb", "aa")
-    assert not stage.was_complete
-    assert not stage.pending(FRAMES)
-    assert opened("bb", "aa").pending(FRAMES) == [], "killed right after"
-    with pytest.raises(InputError, match=r"upstream\.garment"):
-        open_test_stage(tmp_path, garment="aa")
-
-
 def test_a_frame_cut_off_by_other_means_is_pending(tmp_path: Path):
     stage = open_test_stage(tmp_path / "stage")
     finish_frames(stage)
@@ -182,9 +165,9 @@ def test_a_frame_cut_off_by_other_means_is_pending(tmp_path: Path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"settings": Settings(weight=2.0)}, "config.weight: was 1.0, now 2.0"),
-        ({"settings": Settings(sizes=(1,))}, "config.sizes: was [1, 2], now [1]"),
-        ({"garment": "bb"}, 'upstream.garment: was "aa", now "bb"'),
+        ({"settings": Settings(weight=2.0)}, "other settings (weight 1.0 to 2.0); with --overwrite"),
+        ({"settings": Settings(sizes=(1,))}, "other settings (sizes [1, 2] to [1]); with --overwrite"),
+        ({"garment": "bb"}, "other inputs (garment changed); with --overwrite"),
     ],
 )
 def test_a_stage_refuses_other_settings_and_keeps_its_files(tmp_path: Path, change: dict, message: str):
@@ -348,7 +331,7 @@ def test_what_is_wrong_with_a_preparation_is_said_as_it_is(workers: int):
     assert (caught.value.where, caught.value.reason) == ("work", "expected a folder, found none")
 
 
-OPENERS = ("open_stage", "open_file_stage")
+OPENERS = ("open_stage", "open_growing_stage", "open_file_stage")
 
 
 def test_the_formats_that_are_known_are_those_that_are_written() -> None:

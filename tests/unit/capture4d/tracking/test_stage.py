@@ -21,7 +21,7 @@ from capture4d.files.atomic import read_json
 from capture4d.files.records import save_body, save_poses
 from capture4d.geometry.mesh import submesh
 from capture4d.motions.retargeting import pose_sequence
-from capture4d.tracking import stage as body_stage
+from capture4d.tracking import first_pass
 from capture4d.tracking.config import TrackingConfig
 from capture4d.tracking.sequence import Followed, Quality
 from capture4d.tracking.stage import run
@@ -112,18 +112,18 @@ def test_a_frame_is_done_once_all_its_files_are_written(
     writer: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Killed right after any of its files, the frame is either still to be done or whole."""
-    write = getattr(body_stage, writer)
+    write = getattr(first_pass, writer)
 
     def write_and_die(path: Path, *arguments: object, **arrays: object) -> None:
         write(path, *arguments, **arrays)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(body_stage, writer, write_and_die)
+    monkeypatch.setattr(first_pass, writer, write_and_die)
     state = BodyState(np.eye(3)[None], np.zeros(3), np.zeros(2))
     followed = Followed(state, np.zeros((2, 2)), Quality((), False, 1.0, 0.001, 0.0), "start", 0, 0)
     path = tmp_path / "frames" / "000005.npz"
     with pytest.raises(KeyboardInterrupt):
-        body_stage._save_followed(path, followed, 0.1)
+        first_pass._save_followed(path, followed, 0.1)
     assert not path.is_file() or (tmp_path / "times" / "000005.json").is_file()
 
 

@@ -147,7 +147,7 @@ def test_the_command_says_where_they_are_and_refuses_other_settings(work: Path, 
     assert command(work) == 0
     assert capsys.readouterr().out.strip() == f"offset images: {work / OFFSETS}"
     assert command(work, "--components", "3") == 1
-    assert "other settings (config.components: was 128, now 3); use --overwrite" in capsys.readouterr().err
+    assert "other settings (components 128 to 3); with --overwrite" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

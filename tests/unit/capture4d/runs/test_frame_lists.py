@@ -1,0 +1,61 @@
+"""Frames as text: what is written is read, and what is no frame of the take is said."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from capture4d.errors import InputError
+from capture4d.runs.frame_lists import chosen_frames, counted, expanded, listed
+
+
+@given(st.sets(st.integers(0, 400), min_size=1))
+def test_a_list_is_read_as_it_was_written(frames: set[int]):
+    text = listed(frames, most=0)
+    assert expanded(text) == tuple(sorted(frames))
+    assert chosen_frames(text, tuple(range(401))) == tuple(sorted(frames))
+
+
+@given(st.integers(0, 50), st.integers(0, 50), st.integers(1, 9))
+def test_a_range_with_a_step_counts_from_its_first_number(first: int, length: int, step: int):
+    text = f"{first}-{first + length}:{step}"
+    assert chosen_frames(text, range(200)) == tuple(range(first, first + length + 1, step))
+
+
+def test_lists_are_short():
+    assert listed([]) == ""
+    assert listed([1, 2, 3, 5, 10, 20, 30, 31]) == "1-3,5,10-30:10,31"
+    assert listed([4, 5]) == "4-5"
+    assert listed(range(0, 100, 7), most=3) == "0-98:7"
+    assert listed([1, 3, 4, 8, 9, 15, 16, 40], most=3) == "1,3-4,..."
+    assert counted([12], "added") == "frame 12 added"
+    assert counted([21, 22, 23], "gone") == "3 frames gone (21-23)"
+
+
+def test_numbers_of_a_range_that_the_take_lacks_are_passed_over():
+    assert chosen_frames(" 1 , 3-9", (1, 2, 4, 6, 11)) == (1, 4, 6)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "expected frames such as 1,5,10-20 or 1-200:5, found ''"),
+        ("1,,2", "expected frames such as"),
+        ("a", "expected frames such as 1,5,10-20 or 1-200:5, found 'a'"),
+        ("5-", "expected frames such as"),
+        ("-5", "expected frames such as"),
+        ("5:2", "expected frames such as"),
+        ("9-3", "expected a range upwards, its step at least 1, found '9-3'"),
+        ("3-9:0", "expected a range upwards, its step at least 1, found '3-9:0'"),
+        ("7", "expected frames that the take has (1-5), found '7'"),
+        ("1,7-9", "expected frames that the take has (1-5), found '7-9'"),
+        ("²", "expected frames such as"),
+    ],
+)
+def test_what_is_no_list_of_frames_is_one_line(text: str, said: str):
+    with pytest.raises(InputError) as caught:
+        chosen_frames(text, (1, 2, 3, 4, 5))
+    assert str(caught.value).startswith(f"--frames: {said}")
+
+
+def test_large_numbers_cost_nothing():
+    assert chosen_frames("0-2147483647", (5, 2**31 - 1)) == (5, 2**31 - 1)
