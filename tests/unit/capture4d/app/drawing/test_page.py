@@ -22,6 +22,9 @@ class Balanced(HTMLParser):
         if tag not in VOID:
             self.open.append(tag)
 
+    def handle_startendtag(self, tag, attrs):
+        pass
+
     def handle_endtag(self, tag):
         assert self.open.pop() == tag
 
@@ -46,7 +49,7 @@ def page(monkeypatch):
     return render_page(
         "own", "own.html.jinja", title="<b>take</b>", subtitle="one & two",
         tiles=[Tile("1.2", "mm", "<i>fit</i>")],
-        table=Table([Column("frames"), Column("fit", number=True)], [["1-3", Badge("lost")], ["<4>", "0.5"]], stacks=True),
+        table=Table([Column("frames"), Column("fit", True)], [["1-3", Badge("lost")], ["<4>", "1"]], stacks=True),
         charts=[Chart("a curve", '<svg viewBox="0 0 1 1"><path d="M0 0"/></svg>')],
         film=Film("a film", "data:image/webp;base64,AAAA", ["data:a", "data:b"], ['frame "0"', "frame 1"], "plays"),
     )  # fmt: skip
