@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from importlib.metadata import version
-from itertools import groupby
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
 
 from capture4d.app.differences.sides import Side
+from capture4d.app.differences.table import frames_told
 from capture4d.app.differences.work_diff import WorkDiff
-from capture4d.app.drawing.charts import Line, line_chart
+from capture4d.app.drawing.charts import Line, joined_chart, line_chart
+from capture4d.app.drawing.page import Badge, Chart, Column, Table, Tile, render_page
 from capture4d.app.drawing.palette import BLUE, ORANGE
+from capture4d.app.report.flagged import verdict_counts, verdict_runs
 from capture4d.app.report.limits import KNOWN_METRICS
-from capture4d.app.report.metrics import column, frame_ranges, shown
+from capture4d.app.report.metrics import column, shown
+from capture4d.captures.work_folder import VERDICTS
 from capture4d.files.atomic import write_bytes
 from capture4d.files.outputs import new_files
 
@@ -56,115 +57,139 @@ def default_page(found: WorkDiff) -> Path:
 
 
 def _page(found: WorkDiff) -> str:
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("capture4d.app.differences", "."), autoescape=True, undefined=jinja2.StrictUndefined
-    )
     before, after = found.before, found.after
-    return environment.get_template("diff.html.jinja").render(
-        version=version("capture4d"),
-        diff=found,
+    only = ((before, found.only_before), (after, found.only_after))
+    return render_page(
+        "capture4d.app.differences",
+        "diff.html.jinja",
+        title=f"{before.name} → {after.name}",
+        takes=found.takes,
+        same_take=found.same_take,
+        notes=[*found.notes, *([found.tally] if found.tally else [])],
+        tiles=list(_tiles(found)),
+        settings=_settings(found),
         sides=[_side(before, BEFORE), _side(after, AFTER)],
-        tiles=_tiles(found),
-        metrics=[
-            {
-                "metric": metric,
-                "before": shown(metric.before),
-                "after": shown(metric.after),
-                "verdict": metric.verdict if metric.verdict in ("better", "worse") else "",
-            }
-            for metric in found.metrics
-        ],
-        over_all=any(metric.over_all for metric in found.metrics),
-        verdicts=[
-            {"before": each.before, "after": each.after, "count": len(each.frames), "frames": frame_ranges(each.frames)}
-            for each in found.verdicts
-        ],
-        only=[
-            (side.name, frame_ranges(numbers))
-            for side, numbers in ((before, found.only_before), (after, found.only_after))
-            if numbers
-        ],
-        charts=list(_charts(found)),
+        only=[f"Only in {side.name}: {frames_told(numbers, side.records)}." for side, numbers in only if numbers],
+        verdicts=_verdicts(found),
         worst=_worst(found),
+        charts=list(_charts(found)),
+        metrics=_metrics(found),
+        over_all=any(metric.over_all for metric in found.metrics),
+        places=[(side.name, str(side.work.path.resolve())) for side in (before, after)],
     )
+
+
+def _tiles(found: WorkDiff) -> Iterator[tuple[Tile, str, str]]:
+    """Both figures, how they differ, and which is better."""
+    metrics = {metric.key: metric for metric in found.metrics}
+    for key, name in TILES:
+        metric = metrics.get(key)
+        if metric is not None:
+            figures = f"{shown(metric.before)} → {shown(metric.after)}"
+            judged = f", {metric.verdict}" if metric.verdict in ("better", "worse") else ""
+            change = "" if metric.verdict == "unknown" else f"{metric.change}{judged}"
+            yield Tile(figures, metric.unit, name), change, metric.verdict
+
+
+def _settings(found: WorkDiff) -> Table:
+    columns = [Column("stage"), Column("setting or input"), Column(found.before.name), Column(found.after.name)]
+    rows = [
+        [each.stage, each.name, each.before or "–", each.after or "–", each.words.partition(": ")[2]]
+        for each in found.settings
+    ]
+    return Table([*columns, Column("in words")], rows, stacks=True)
 
 
 def _side(side: Side, colour: str) -> Mapping[str, Any]:
-    verdicts = [str(side.records[number].get("verdict", "unknown")) for number in sorted(side.records)]
+    records = [record for _, record in sorted(side.records.items()) if "verdict" in record]
     return {
         "name": side.name,
         "told": side.told,
-        "path": str(side.work.path.resolve()),
         "colour": colour,
-        "strip": [(verdict, len(list(group))) for verdict, group in groupby(verdicts)],
-        "counts": [(verdict, verdicts.count(verdict)) for verdict in dict.fromkeys(verdicts)],
+        "strip": verdict_runs(records),
+        "counts": verdict_counts(records, VERDICTS),
     }
 
 
-def _tiles(found: WorkDiff) -> list[Mapping[str, str]]:
-    metrics = {metric.key: metric for metric in found.metrics}
-    return [
-        {
-            "name": name,
-            "before": shown(metrics[key].before),
-            "after": shown(metrics[key].after),
-            "unit": metrics[key].unit,
-            "change": "" if metrics[key].verdict == "unknown" else metrics[key].change,
-            "verdict": metrics[key].verdict,
-        }
-        for key, name in TILES
-        if key in metrics
+def _verdicts(found: WorkDiff) -> Table:
+    columns = [Column("verdict was"), Column("is"), Column("frames", number=True), Column("which")]
+    rows = [
+        [Badge(each.before), Badge(each.after), str(len(each.frames)), frames_told(each.frames, found.frame_ids)]
+        for each in found.verdicts
     ]
+    return Table(columns, rows)
 
 
-def _charts(found: WorkDiff) -> Sequence[Mapping[str, str]]:
-    """A chart a measure, over the frames of either folder; a frame that only one has is a gap in the other's curve."""
-    numbers = sorted({*found.before.records, *found.after.records})
-    units = {metric.key: (metric.unit, metric.meaning) for metric in found.metrics}
-    charts = []
-    for key in KNOWN_METRICS:
-        if key not in units:
-            continue
-        lines = [
-            Line(side.name, column([side.records.get(number, {}) for number in numbers], key), colour)
-            for side, colour in ((found.before, BEFORE), (found.after, AFTER))
-        ]
-        measured = np.any([np.isfinite(line.values) for line in lines], axis=0)
-        if not measured.any():
-            continue
-        kept = np.flatnonzero(measured)
-        shorter = [Line(line.name, line.values[kept], line.colour) for line in lines]
-        unit, meaning = units[key]
-        floor = 1.0 if key == "stretch_p99" else 0.0
-        svg = line_chart([numbers[row] for row in kept], shorter, floor=floor)
-        charts.append({"key": key, "unit": unit, "meaning": meaning, "svg": svg})
-    if found.apart_mm is not None:
-        svg = line_chart(list(found.frame_ids), [Line("vertex to vertex, mean", found.apart_mm, BLUE)])
-        apart = {"key": "apart", "unit": "mm", "meaning": "one surface to the other, vertex to vertex", "svg": svg}
-        charts.insert(0, apart)
-    return charts
-
-
-def _worst(found: WorkDiff) -> Mapping[str, Any] | None:
+def _worst(found: WorkDiff) -> Table | None:
     """The frames that have become worse by most."""
     metrics = {metric.key: metric for metric in found.metrics}
     key = next((key for key in WORST_BY if key in metrics and metrics[key].delta is not None), None)
     if key is None or not found.frame_ids or metrics[key].over_all:
         return None
-    values = [column([side.records[number] for number in found.frame_ids], key) for side in (found.before, found.after)]
+    sides = (found.before, found.after)
+    values = [column([side.records[number] for number in found.frame_ids], key) for side in sides]
     grown = np.nan_to_num(values[1] - values[0], nan=-np.inf)
-    order = [int(place) for place in np.argsort(-grown)[:MOST_FRAMES] if grown[place] > 0]
-    rows = [
-        {
-            "frame_id": found.frame_ids[place],
-            "verdicts": [
-                str(side.records[found.frame_ids[place]].get("verdict", "")) for side in (found.before, found.after)
-            ],
-            "before": shown(float(values[0][place])),
-            "after": shown(float(values[1][place])),
-            "apart": None if found.apart_mm is None else shown(float(found.apart_mm[place])),
-            "reasons": "; ".join(found.after.records[found.frame_ids[place]].get("reasons", [])),
-        }
-        for place in order
+    rows = []
+    for place in np.argsort(-grown)[:MOST_FRAMES].tolist():
+        if grown[place] <= 0:
+            break
+        number = found.frame_ids[place]
+        apart = [] if found.apart_mm is None else [shown(float(found.apart_mm[place]))]
+        rows.append(
+            [
+                str(number),
+                *(Badge(str(side.records[number].get("verdict", ""))) for side in sides),
+                *(shown(float(figures[place])) for figures in values),
+                *apart,
+                "; ".join(found.after.records[number].get("reasons", [])),
+            ]
+        )
+    named = f"{key}, {metrics[key].unit}"
+    columns = [Column("frame"), Column("was"), Column("is"), Column(named, number=True), Column("now", number=True)]
+    if found.apart_mm is not None:
+        columns.append(Column("surfaces apart, mm", number=True))
+    return Table([*columns, Column("reasons now")], rows) if rows else None
+
+
+def _charts(found: WorkDiff) -> Iterator[tuple[Chart, str]]:
+    """A chart a measure, over the frames of either folder, and what the measure is; a frame that only one folder has
+    is a gap in the other's curve."""
+    if found.apart_mm is not None:
+        line = Line("vertex to vertex, mean", found.apart_mm, BLUE)
+        yield Chart("apart, mm", line_chart(list(found.frame_ids), [line])), "one surface to the other"
+    numbers = sorted({*found.before.records, *found.after.records})
+    metrics = {metric.key: metric for metric in found.metrics}
+    for key in (key for key in KNOWN_METRICS if key in metrics):
+        lines = [
+            Line(side.name, column([side.records.get(number, {}) for number in numbers], key), colour)
+            for side, colour in ((found.before, BEFORE), (found.after, AFTER))
+        ]
+        if any(np.isfinite(line.values).any() for line in lines):
+            unit = metrics[key].unit
+            svg = joined_chart(numbers, lines, floor=1.0 if key == "stretch_p99" else 0.0)
+            yield Chart(f"{key}, {unit}" if unit else key, svg), metrics[key].meaning
+
+
+def _metrics(found: WorkDiff) -> Table:
+    columns = [
+        Column("name"),
+        Column(found.before.name, number=True),
+        Column(found.after.name, number=True),
+        Column("unit"),
+        Column("change", number=True),
+        Column(""),
+        Column("what it is"),
     ]
-    return {"key": key, "unit": metrics[key].unit, "rows": rows} if rows else None
+    rows = [
+        [
+            f"{metric.key}{' *' if metric.over_all else ''}",
+            shown(metric.before),
+            shown(metric.after),
+            metric.unit,
+            metric.change,
+            Badge(metric.verdict) if metric.verdict in ("better", "worse") else "",
+            metric.meaning,
+        ]
+        for metric in found.metrics
+    ]
+    return Table(columns, rows)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from capture4d.app.differences.changes import MetricChange
 from capture4d.app.differences.work_diff import WorkDiff
-from capture4d.app.report.metrics import frame_ranges, shown
+from capture4d.app.report.metrics import shown
+from capture4d.captures.frame_ranges import frame_ranges
 
-__all__ = ["aligned", "table_lines"]
+__all__ = ["aligned", "frames_told", "table_lines"]
 
 _MOST_SETTINGS = 30
+_MOST_RANGES = 8
 
 
 def table_lines(found: WorkDiff) -> list[str]:
@@ -28,7 +30,9 @@ def table_lines(found: WorkDiff) -> list[str]:
         lines += ["", "No metrics: neither has measured a frame yet."]
     if found.verdicts:
         lines += ["", "Verdicts that changed:"]
-        lines += [f"  {each.before} to {each.after}: {_frames(each.frames)}" for each in found.verdicts]
+        lines += [
+            f"  {each.before} to {each.after}: {frames_told(each.frames, found.frame_ids)}" for each in found.verdicts
+        ]
     lines += _only_in(found)
     return lines
 
@@ -49,11 +53,12 @@ def _cells(metric: MetricChange) -> tuple[str, ...]:
 
 def _only_in(found: WorkDiff) -> list[str]:
     sides = ((found.before, found.only_before), (found.after, found.only_after))
-    return [f"Only in {side.name}: {_frames(numbers)}" for side, numbers in sides if numbers]
+    return [f"Only in {side.name}: {frames_told(numbers, side.records)}" for side, numbers in sides if numbers]
 
 
-def _frames(numbers: Sequence[int]) -> str:
-    return f"{'frame' if len(numbers) == 1 else 'frames'} {frame_ranges(numbers)}"
+def frames_told(numbers: Sequence[int], among: Iterable[int]) -> str:
+    """One frame, or ranges such as 12-19, 44; as many ranges as a line holds."""
+    return f"{'frame' if len(numbers) == 1 else 'frames'} {frame_ranges(numbers, among=among, most=_MOST_RANGES)}"
 
 
 def aligned(rows: Sequence[Sequence[str]], *, left: Sequence[int] = (0,)) -> list[str]:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Literal
 
-from capture4d.app.report.metrics import frame_ranges
 from capture4d.preflight.check import Checked
 from capture4d.preflight.findings import Verdict
 
@@ -65,10 +65,22 @@ def print_table(checked: Checked) -> None:
     if checked.verdict.findings:
         table = Table("", "finding", "what was found", "what to do", title=f"{checked.take.path} ({looked} looked at)")
         for finding in checked.verdict.findings:
-            frames = f"\nframes {frame_ranges(finding.frames)}" if finding.frames else ""
+            frames = f"\nframes {_ranges(finding.frames)}" if finding.frames else ""
             table.add_row(finding.severity, finding.code, finding.found + frames, finding.advice)
         console.print(table)
     else:
         console.print(f"{checked.take.path}: clean ({looked} looked at)", highlight=False, soft_wrap=True)
     if _learns(checked):
         console.print(LEARNED, highlight=False, soft_wrap=True)
+
+
+def _ranges(numbers: Sequence[int], most: int = 6) -> str:
+    """'3-5, 9, ...'"""
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][1] + 1:
+            runs[-1][1] = number
+        else:
+            runs.append([number, number])
+    shown = [str(a) if a == b else f"{a}-{b}" for a, b in runs[:most]]
+    return ", ".join(shown + ["..."] * (len(runs) > most))

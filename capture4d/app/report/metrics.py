@@ -23,7 +23,7 @@ from capture4d.captures.truth import TruthModel
 from capture4d.captures.work_folder import VERDICTS
 from capture4d.types import RegisteredSequence
 
-__all__ = ["METRICS", "column", "frame_ranges", "own_measures", "shown", "summarise", "truth_measures"]
+__all__ = ["METRICS", "column", "own_measures", "shown", "summarise", "truth_measures"]
 
 METRICS: Mapping[str, tuple[str, str, str]] = {
     "fit_mean_mm": ("mm", "lower", "template vertices to the scan's surface, where it has data"),
@@ -144,15 +144,3 @@ def shown(value: float | None) -> str:
     if value == round(value) and abs(value) < 1e6:
         return f"{value:.0f}"
     return f"{value:.3g}"
-
-
-def frame_ranges(numbers: Sequence[int], most: int = 6) -> str:
-    """Ascending frame numbers in a line: '3-5, 9, ...'."""
-    runs: list[list[int]] = []
-    for number in numbers:
-        if runs and number == runs[-1][1] + 1:
-            runs[-1][1] = number
-        else:
-            runs.append([number, number])
-    told = [str(first) if first == last else f"{first}-{last}" for first, last in runs[:most]]
-    return ", ".join(told + ["..."] * (len(runs) > most))
