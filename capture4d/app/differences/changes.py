@@ -15,6 +15,7 @@ from capture4d.app.report.animation import ANIMATION_METRICS
 from capture4d.app.report.animation import summarise as summarise_animation
 from capture4d.app.report.metrics import METRICS, column, shown, summarise
 from capture4d.files.reading import shortened
+from capture4d.runs.changes import description_changes
 
 __all__ = ["MetricChange", "SettingChange", "metric_changes", "setting_changes"]
 
@@ -46,10 +47,10 @@ class SettingChange:
     """A setting, or an input, of a stage that is not the same in both folders."""
 
     stage: str
-    kind: Literal["setting", "input", "stage"]
+    kind: Literal["setting", "input", "description", "stage"]
     name: str
     before: str | None
-    """None where the first folder has nothing of the kind."""
+    """None where the first folder has nothing of the kind, or the name says all."""
     after: str | None
 
     @property
@@ -57,6 +58,8 @@ class SettingChange:
         """In a line, without the folders' names."""
         if self.kind == "stage":
             return f"{self.stage}: was {self.before or 'not done'}, now {self.after or 'not done'}"
+        if self.kind == "description":
+            return f"{self.stage}: {self.name}"
         if self.kind == "input":
             made = "no longer made" if self.after is None else "now made" if self.before is None else "made"
             return f"{self.stage}: {made} from {self.name}"
@@ -90,10 +93,14 @@ def _stage_changes(stage: str, one: Mapping[str, Any], other: Mapping[str, Any])
         yield SettingChange(stage, "setting", "format of the output", f"{one.get('schema')}", f"{other.get('schema')}")
     made = [record.get("upstream", {}) for record in (one, other)]
     for name in dict.fromkeys((*made[0], *made[1])):
-        if name in INPUTS and made[0].get(name) != made[1].get(name):
-            another, the = TRACKED if (stage, name) == ("register", "body") else INPUTS[name]
+        if name != "regressor" and made[0].get(name) != made[1].get(name):  # a part of the model
+            another, the = (
+                TRACKED if (stage, name) == ("register", "body") else INPUTS.get(name, (f"another {name}", name))
+            )
             told = another if name in made[0] and name in made[1] else the
             yield SettingChange(stage, "input", told, *(_digest(record.get(name)) for record in made))
+    for words in description_changes(other.get("description", {}), one.get("description", {})):
+        yield SettingChange(stage, "description", words, None, None)
     said = [dict(_flat(record.get("config"))) for record in (one, other)]
     for name in dict.fromkeys((*said[0], *said[1])):
         if name != "schema" and said[0].get(name) != said[1].get(name):

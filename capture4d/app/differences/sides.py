@@ -13,6 +13,7 @@ from capture4d.errors import InputError
 from capture4d.files.atomic import read_json, read_json_lines
 from capture4d.files.json_values import entry, whole
 from capture4d.files.reading import reading
+from capture4d.runs.made import Ledger
 
 __all__ = ["Side", "read_side", "short_names"]
 
@@ -35,6 +36,8 @@ class Side:
     """Measures and verdict of each frame, tracking's (`track_...`) and those against the truth among them."""
     reported: Mapping[str, float | None]
     """Metrics over all frames as the report has them; empty where there is no report of this state."""
+    scans: Mapping[int, str]
+    """Digest of the scan of each frame, as extraction or tracking has read it."""
 
     def input_digest(self, stage: str, name: str) -> str | None:
         """Digest of what a stage was made from."""
@@ -74,7 +77,8 @@ def read_side(work: WorkFolder, name: str) -> Side:
             records = found
         else:
             _add(records, found)
-    return Side(work, name, _take_name(work), kind, finished, records, reported)
+    scans = {**_scans(work.path / "body", "refined"), **_scans(work.path / "garment", "frames")}
+    return Side(work, name, _take_name(work), kind, finished, records, reported, scans)
 
 
 def short_names(first: Path, second: Path) -> tuple[str, str]:
@@ -138,6 +142,12 @@ def _reported(path: Path) -> dict[str, float | None]:
 def _measured_by_report(path: Path) -> dict[int, dict[str, Any]]:
     """What the report alone has measured; earlier versions kept no record of it."""
     return _by_number(path, read_json_lines(path)) if path.is_file() else {}
+
+
+def _scans(folder: Path, files: str) -> dict[int, str]:
+    """Digests of the scans that a stage's files were made from, by frame."""
+    made = Ledger.read(folder).inputs_of(files)
+    return {int(Path(place).stem): inputs["scan"] for place, inputs in made.items() if "scan" in inputs}
 
 
 def _take_name(work: WorkFolder) -> str:

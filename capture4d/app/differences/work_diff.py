@@ -14,6 +14,7 @@ from capture4d.app.differences.sides import Side, read_side, short_names
 from capture4d.app.report.limits import parse_numbers, unknown_metric
 from capture4d.captures.work_folder import WorkFolder
 from capture4d.errors import InputError
+from capture4d.runs.frame_lists import counted
 
 __all__ = ["VerdictChange", "WorkDiff", "as_json", "broken_limits", "diff_works", "parse_worse_limits"]
 
@@ -95,15 +96,21 @@ def diff_works(first: WorkFolder, second: WorkFolder) -> WorkDiff:
 
 
 def _takes(before: Side, after: Side) -> tuple[bool, str]:
+    """Scans that both have read decide; of folders of earlier versions, what they say they were made from."""
     if "animated" in (before.kind, after.kind):
         return _motions(before, after)
-    stages = ("garment", "body")
-    digests = [{side.input_digest(stage, "capture") for stage in stages} - {None} for side in (before, after)]
-    if digests[0] & digests[1]:
+    both = sorted(set(before.scans) & set(after.scans))
+    other = [number for number in both if before.scans[number] != after.scans[number]]
+    digests = [side.input_digest("garment", "capture") for side in (before, after)]
+    if (both and not other) or (digests[0] is not None and digests[0] == digests[1]):
         return True, f"One take, {after.take}."
+    if len(other) < len(both):
+        return True, f"One take, {after.take}; {counted(other, 'replaced')}."
     if before.take != after.take:
         return False, f"Different takes, {before.take} and {after.take}: frames of one number are not one moment."
-    return True, f"One take by its name, {after.take}, whose scans or description have changed."
+    if not both:
+        return True, f"One take by its name, {after.take}; no scan was read in both."
+    return False, f"Two takes of one name, {after.take}: no scan of one is a scan of the other."
 
 
 def _motions(before: Side, after: Side) -> tuple[bool, str]:

@@ -8,6 +8,7 @@ from capture4d.app.differences.table import aligned, table_lines
 from capture4d.app.differences.work_diff import VerdictChange, as_json, broken_limits, diff_works, parse_worse_limits
 from capture4d.captures.work_folder import open_work
 from capture4d.errors import InputError
+from capture4d.files.atomic import write_json_lines
 from tests.unit.capture4d.app.differences.conftest import record
 
 
@@ -49,8 +50,24 @@ def test_other_takes_are_told(write_work, write_report, tmp_path, diff):
         write_report(tmp_path / name, {})
     found = diff()
     assert found.same_take
-    assert found.takes == "One take by its name, walk, whose scans or description have changed."
+    assert found.takes == "One take by its name, walk; no scan was read in both."
     assert diff("a", "a").takes == "One take, walk."
+
+
+def test_the_scans_that_were_read_decide(write_work, tmp_path, diff):
+    def read(name: str, scans: dict[int, str]) -> None:
+        lines = [{"path": f"frames/{number:06d}.npz", "inputs": {"scan": scan}, "digest": "", "size": 0, "time": 0}
+                 for number, scan in scans.items()]  # fmt: skip
+        work = write_work(tmp_path / name, [record(number) for number in scans], upstream={"capture": name})
+        write_json_lines(work / "garment" / "made.jsonl", lines)
+
+    read("a", {1: "x", 2: "y", 3: "z"})
+    read("b", {2: "y", 3: "z", 4: "w"})
+    read("c", {1: "x", 2: "changed", 3: "z"})
+    read("d", {1: "p", 2: "q"})
+    assert (diff("a", "b").same_take, diff("a", "b").takes) == (True, "One take, b.")
+    assert (diff("a", "c").same_take, diff("a", "c").takes) == (True, "One take, c; frame 2 replaced.")
+    assert not diff("a", "d").same_take
 
 
 def test_animations_are_told_by_motion_and_garment(write_work, tmp_path, diff):
