@@ -31,6 +31,7 @@ from wrinkles.normal_maps.config import ApplyConfig, PairConfig, WrinkleConfig
 from wrinkles.offset_images.config import OffsetConfig
 
 if TYPE_CHECKING:
+    from capture4d.app.differences.work_diff import WorkDiff
     from capture4d.calibration.check import CameraCheck
     from capture4d.calibration.stage import CalibrationResult
     from capture4d.preflight.check import Checked
@@ -40,27 +41,10 @@ if TYPE_CHECKING:
     from retarget.animation.stage import Wearer
 
 __all__ = [
-    "animate",
-    "calibrate",
-    "check",
-    "check_rig",
-    "compare",
-    "extract",
-    "fit",
-    "register",
-    "register_mesh",
-    "report",
-    "run",
-    "scan",
-    "synth",
-    "synth_board",
-    "template",
-    "track",
-    "wrinkles_apply",
-    "wrinkles_maps",
-    "wrinkles_offsets",
-    "wrinkles_train",
-]
+    "animate", "calibrate", "check", "check_rig", "compare", "diff", "extract", "fit", "register", "register_mesh",
+    "report", "run", "scan", "synth", "synth_board", "template", "track", "wrinkles_apply", "wrinkles_maps",
+    "wrinkles_offsets", "wrinkles_train",
+]  # fmt: skip
 
 Place: TypeAlias = str | Path
 AnyCapture: TypeAlias = Capture | Place
@@ -340,6 +324,7 @@ def template(
     *,
     body: Place | None = None,
     poses: Place | None = None,
+    overwrite: bool = False,
 ) -> TemplateResult:
     """Make a template of a garment mesh, or of a part of the body: bound, its borders named, its UVs checked.
 
@@ -347,14 +332,24 @@ def template(
         mesh: garment that lies on the body; None where `config` names a region of the body.
         body: the body it lies on, a body.npz; the built-in one if None.
         poses: motion file with the pose and the shape in which it lies there; the rest pose if None.
+        overwrite: write it over a file that holds something else.
     """
+    from capture4d.files.outputs import new_files
     from capture4d.templates.stage import run as stage
 
-    return stage(_maybe(mesh), Path(output), config or TemplateConfig(), body=_maybe(body), poses=_maybe(poses))
+    given, place, config = [_maybe(path) for path in (mesh, body, poses)], Path(output), config or TemplateConfig()
+    with new_files([place], inputs=given, overwrite=overwrite) as workshop:
+        result = stage(given[0], workshop / place.name, config, body=given[1], poses=given[2])
+    return replace(result, path=place)
 
 
 def register_mesh(
-    template: Place, scan: Place, output: Place, config: MeshRegistrationConfig | None = None
+    template: Place,
+    scan: Place,
+    output: Place,
+    config: MeshRegistrationConfig | None = None,
+    *,
+    overwrite: bool = False,
 ) -> MeshRegistration:
     """Register one mesh file to another; writes the result, and its measures as JSON beside it.
 
@@ -363,8 +358,8 @@ def register_mesh(
     from capture4d.extraction.garment import painted_border
     from registration.register_mesh import run as stage
 
-    config = config or MeshRegistrationConfig()
-    return stage(Path(template), Path(scan), Path(output), config, find_border=painted_border)
+    given, config = (Path(template), Path(scan), Path(output)), config or MeshRegistrationConfig()
+    return stage(*given, config, find_border=painted_border, overwrite=overwrite)
 
 
 @logged_stage("fit")
@@ -506,6 +501,23 @@ def compare(
 
     learned, config = _maybe(garment_model), config or CompareConfig()
     return stage(_work(work), Path(model), config, garment_model=learned, workers=workers, overwrite=overwrite)
+
+
+def diff(first: AnyWork, second: AnyWork, page: Place | None = None, *, overwrite: bool = False) -> WorkDiff:
+    """Compare two work folders, finished or not: settings, metrics, and frames by their numbers.
+
+    Args:
+        first: what there was; `second`, what it has become.
+        page: HTML file to write, with the curves of both.
+        overwrite: write it over a file that is something else.
+    """
+    from capture4d.app.differences.page import write_page
+    from capture4d.app.differences.work_diff import diff_works
+
+    found = diff_works(_work(first), _work(second))
+    if page is not None:
+        write_page(found, Path(page), overwrite=overwrite)
+    return found
 
 
 def _capture(capture: AnyCapture) -> Capture:

@@ -10,9 +10,10 @@ of a shirt, for which the constants are made. Units therefore change the numbers
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -20,7 +21,8 @@ from jaxtyping import Float32, Float64
 from capture4d.captures.scan_files import whole_surface
 from capture4d.colours.spaces import parse_colour
 from capture4d.errors import InputError
-from capture4d.files.atomic import nan_to_none, write_json
+from capture4d.files.atomic import nan_to_none, read_json, write_json
+from capture4d.files.outputs import new_files, require_apart
 from capture4d.geometry.mesh import boundary_loops, submesh
 from capture4d.geometry.seams import weld
 from capture4d.mesh_files.meshes import WRITABLE, read_coloured_mesh, read_mesh, write_mesh
@@ -66,20 +68,25 @@ def run(
     config: MeshRegistrationConfig,
     *,
     find_border: FindBorder | None = None,
+    overwrite: bool = False,
 ) -> MeshRegistration:
     """Register one mesh file to another; writes the result, and its measures as JSON beside it.
 
     Args:
-        output_path: .ply, .obj or .glb; the JSON has the same name.
+        output_path: .ply, .obj, .glb or .off; the JSON has the same name.
+        overwrite: write over files that hold something else than this result.
     Raises:
-        InputError: the output is no mesh file, an input is missing, damaged or empty, the colour is not in the scan, or
-            the sizes cannot belong to one unit.
+        InputError: the output is no mesh file, or is one of the inputs, or is there already and something else; an
+            input is missing, damaged or empty, the colour is not in the scan, or the sizes cannot belong to one unit.
     """
     begin = time.process_time()
     if output_path.suffix.lower() not in WRITABLE:
         raise InputError(
             f"expected a mesh file ({', '.join(WRITABLE)}), found '{output_path.suffix}'", where=output_path
         )
+    outputs, inputs = [output_path, output_path.with_suffix(".json")], [template_path, scan_path]
+    require_apart(outputs, inputs)
+    known = _earlier(outputs, str(template_path), str(scan_path), overwrite)
     read_scan = read_coloured_mesh if config.border_colour else read_mesh
     template_file, scan_file = read_mesh(template_path), read_scan(scan_path, faces_needed=False)
     result = register_mesh(
@@ -92,24 +99,39 @@ def run(
         scan_name=str(scan_path),
     )
     mesh = template_file.mesh.with_vertices(result.vertices)
-    write_mesh(output_path, mesh, polygon_sizes=template_file.polygon_sizes)
     units = config.units if config.units != "auto" else guess_units(template_file.mesh)
-    numbers = nan_to_none(result.quality.numbers)
-    write_json(
-        output_path.with_suffix(".json"),
-        {
-            "template": str(template_path),
-            "scan": str(scan_path),
-            "units": units,
-            "scan_faces": "estimated" if result.estimated else "given",
-            "verdict": result.quality.verdict,
-            "reasons": list(result.quality.reasons),
-            **numbers,
-            "cpu_s": round(time.process_time() - begin, 4),
-        },
-    )
+    measures = {
+        "template": str(template_path),
+        "scan": str(scan_path),
+        "units": units,
+        "scan_faces": "estimated" if result.estimated else "given",
+        "verdict": result.quality.verdict,
+        "reasons": list(result.quality.reasons),
+        **nan_to_none(result.quality.numbers),
+    }
+    same = {key: value for key, value in known.items() if key != "cpu_s"} == measures
+    cpu_s = known["cpu_s"] if same and "cpu_s" in known else round(time.process_time() - begin, 4)
+    with new_files(outputs, inputs=inputs, overwrite=overwrite) as workshop:
+        write_mesh(workshop / output_path.name, mesh, polygon_sizes=template_file.polygon_sizes)
+        write_json(workshop / outputs[1].name, {**measures, "cpu_s": cpu_s})
     noted = ((template_path, template_file), (scan_path, scan_file))
     return replace(result, notes=tuple(f"{path}: {note}" for path, found in noted for note in found.notes))
+
+
+def _earlier(outputs: Sequence[Path], template: str, scan: str, overwrite: bool) -> Mapping[str, Any]:
+    """The measures of an earlier run on these files, which may have had the same result; empty if there are none.
+
+    Raises:
+        InputError: there are outputs of something else, before any work is done for nothing.
+    """
+    there = [path for path in outputs if path.exists()]
+    if overwrite or not there:
+        return {}
+    report = outputs[-1]
+    known = read_json(report) if report.is_file() else {}
+    if (known.get("template"), known.get("scan")) == (template, scan):
+        return known
+    raise InputError("expected no file yet, or this very result; found another; use --overwrite", where=there[0])
 
 
 def register_mesh(

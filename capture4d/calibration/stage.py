@@ -26,6 +26,7 @@ from capture4d.cameras.colmap import write_model
 from capture4d.errors import InputError
 from capture4d.files.arrays import ArrayFile
 from capture4d.files.atomic import read_json, write_json, write_npz
+from capture4d.files.outputs import new_files, new_files_in, require_apart, require_free
 from capture4d.files.records import load_rig, save_rig
 from capture4d.runs.file_stage import open_file_stage
 from capture4d.runs.stage import StageResult
@@ -36,7 +37,7 @@ __all__ = ["CalibrationResult", "read_covariance", "run", "run_check"]
 DETECTOR = "fitted pattern, 2"
 """Corners that an earlier detector has kept are found anew."""
 REPORT, CORNERS, COVARIANCE = "calibration.json", "calibration_corners.npz", "calibration_covariance.npz"
-RECORD = "calibration_stage.json"
+RECORD, PAGE = "calibration_stage.json", "calibration.html"
 SCHEMA = 1
 
 
@@ -77,9 +78,9 @@ def run(
         board: as `parse_board` takes it.
         pattern: how the images lie in the folder.
         colmap: folder for the rig as a COLMAP model as well.
-        overwrite: calibrate anew, also over a rig of other settings.
+        overwrite: calibrate anew, also over a rig of other settings, or one that was not calibrated here.
     Raises:
-        InputError: names the image, the camera, or the argument at fault.
+        InputError: names the image, the camera, or the argument at fault; or a file that would be written over.
         StaleError: there is a rig that was calibrated with other settings.
     """
     geometry = parse_board(board)
@@ -98,25 +99,36 @@ def run(
     )
     files = [output, output.with_name(REPORT), output.with_name(COVARIANCE)]
     digest = stage.made(files)
+    photographs = [image.path for image in found]
     if digest is None:
-        _calibrate(found, images, output, board, geometry, config, workers)
+        if not overwrite and not any(output.with_name(name).is_file() for name in (RECORD, CORNERS)):
+            _require_none([*files, output.with_name(PAGE)])
+        require_apart(files, photographs)
+        detections = _detect_all(found, geometry, output.with_name(CORNERS), images, workers)
+        with new_files(files, inputs=photographs, overwrite=True) as workshop:
+            _calibrate(detections, workshop / output.name, board, geometry, config)
+            if not overwrite and not stage.may_replace(files):  # the rig decides: what is said of it tells times, too
+                require_free(output, workshop / output.name)
         digest = stage.finish(files)
     if colmap is not None:
-        write_model(colmap, load_rig(output))
+        with new_files_in(colmap, inputs=photographs, overwrite=overwrite) as workshop:
+            write_model(workshop, load_rig(output))
     return CalibrationResult(output, digest, report=read_json(output.with_name(REPORT)))
 
 
+def _require_none(files: Sequence[Path]) -> None:
+    """Raise if one of these files, which no run before has made, is there: before work is done for nothing."""
+    there = next((path for path in files if path.exists()), None)
+    if there is not None:
+        raise InputError("expected no file yet, or that of an earlier run; found another; use --overwrite", where=there)
+
+
 def _calibrate(
-    found: Sequence[BoardImage],
-    images: Path,
-    output: Path,
-    board: str,
-    geometry: Board,
-    config: CalibrationConfig,
-    workers: int,
+    detections: Sequence[_Detection], output: Path, board: str, geometry: Board, config: CalibrationConfig
 ) -> None:
+    """Write the rig, its report, and what is uncertain about it."""
+    found = [detection.image for detection in detections]
     names, poses = (sorted({getattr(image, key) for image in found}, key=natural_order) for key in ("camera", "pose"))
-    detections = _detect_all(found, geometry, output.with_name(CORNERS), images, workers)
     sizes = _image_sizes(detections, names)
     views = _views(detections, names, poses)
     _require_seen(found, views, names, geometry)

@@ -20,6 +20,7 @@ from capture4d.cli.answers import TerminatedError, answer_to, complain
 from capture4d.cli.commands.capture import Calibrate, Check, CheckRig
 from capture4d.cli.commands.doctor import Doctor
 from capture4d.cli.commands.files import ConvertBody, ConvertPoses, ConvertRig, RegisterMesh, Template
+from capture4d.cli.commands.folders import Diff
 from capture4d.cli.commands.models import Animate, Fit
 from capture4d.cli.commands.stages import Extract, Register, Report, Run, Track
 from capture4d.cli.commands.synthesis import Demo, Scan, Synth, SynthBoard
@@ -50,6 +51,7 @@ COMMANDS: Mapping[str, Any] = {
     "register": Register,
     "run": Run,
     "report": Report,
+    "diff": Diff,
     "fit": Fit,
     "animate": Animate,
     "wrinkles maps": WrinklesMaps,
@@ -66,7 +68,7 @@ COMMANDS: Mapping[str, Any] = {
     "doctor": Doctor,
 }
 
-_WRITE_FILES = (Check, Template, RegisterMesh, Calibrate, ConvertBody, ConvertPoses, ConvertRig)
+_WRITE_FILES = (Check, Template, RegisterMesh, Calibrate, ConvertBody, ConvertPoses, ConvertRig, Diff)
 """Commands whose output is a file among others, or a folder that comes to be at the end; that of the rest is a folder
 of their own."""
 

@@ -25,6 +25,8 @@ class FileStage:
     _record: dict[str, Any]
     _earlier: dict[str, Any] | None
     """Record of a run before with the same settings, from the same inputs."""
+    _left: Mapping[str, str]
+    """Digest of each file that a run before has left, by its name, whatever that was made with."""
 
     def made(self, files: Sequence[Path]) -> str | None:
         """Their digest, if a run before has made these files from the same and they are still as it left them."""
@@ -33,10 +35,16 @@ class FileStage:
         digest = self._earlier["digest"]
         return digest if file_digest(files, root=self.record_path.parent) == digest else None
 
+    def may_replace(self, files: Sequence[Path]) -> bool:
+        """Whether what is there of these files is as a run before has left it: then none of them is the user's."""
+        there = [path for path in files if path.exists()]
+        return all(path.is_file() and self._left.get(path.name) == _digest(path) for path in there)
+
     def finish(self, files: Sequence[Path]) -> str:
         """Record that these files, in the record's folder, are made; their digest."""
         digest = file_digest(files, root=self.record_path.parent)
-        write_json(self.record_path, {**self._record, "status": "complete", "digest": digest, "finished": _now()})
+        finished = {**self._record, "status": "complete", "digest": digest, "finished": _now()}
+        write_json(self.record_path, {**finished, "files": {path.name: _digest(path) for path in files}})
         return digest
 
 
@@ -65,13 +73,18 @@ def open_file_stage(
     """
     settings = settings_of(name, schema, config)
     earlier = read_record(record_path) if record_path.is_file() else None
+    left = {} if earlier is None else earlier.get("files", {})
     if earlier is not None and not overwrite:
         unchanged_settings(settings, earlier, record_path)
     if earlier is not None and (overwrite or earlier.get("upstream") != dict(upstream)):
         earlier = None
     places = {key: str(path.resolve()) for key, path in sources.items()}
     record = {**settings, "upstream": dict(upstream), "sources": places, "started": _now()}
-    return FileStage(record_path, record, earlier)
+    return FileStage(record_path, record, earlier, left)
+
+
+def _digest(path: Path) -> str:
+    return file_digest([path], root=path.parent)
 
 
 def _now() -> str:

@@ -96,6 +96,10 @@ class Ledger:
         """What is known of a file, whether or not it still is the one."""
         return self._made.get(self._place(path))
 
+    def inputs_of(self, folder: str) -> dict[str, Mapping[str, str]]:
+        """What each file of one of the stage's folders was made from, by its place."""
+        return {place: made.inputs for place, made in self._made.items() if place.rpartition("/")[0] == folder}
+
     def stands(self, path: Path, inputs: Mapping[str, str]) -> bool:
         """Whether a file is there, whole, and was made from the same."""
         made = self.of(path)

@@ -23,6 +23,7 @@ from capture4d.captures.work_folder import ANIMATE, VERDICTS, stack_vertices
 from capture4d.errors import InputError
 from capture4d.files.arrays import map_array
 from capture4d.files.atomic import file_digest, read_json, write_json, write_json_lines, write_npy, write_npz
+from capture4d.files.outputs import require_apart
 from capture4d.files.records import load_body, load_poses, save_body, save_garment, save_poses
 from capture4d.motions.motion_files import read_motion, resample, told
 from capture4d.runs.stage import Stage, StageResult, open_stage
@@ -75,8 +76,10 @@ def run(
         output: work folder; gets body/ and registration/.
         device: of the LSTM.
     Raises:
-        InputError: a file is damaged, the poses or the body are of another skeleton, or numbers are not finite.
+        InputError: a file is damaged, or would be written over; the poses or the body are of another skeleton, or
+            numbers are not finite.
     """
+    require_apart(_motion_files(output), [poses, wearer.body])
     known, name = _model(model, config, device)
     scene = _scene(known, poses, wearer, config)
     digest = file_digest(regressor_files(known.folder, name), root=known.folder)
@@ -104,6 +107,7 @@ def run_on_coefficients(
 ) -> StageResult:
     """`run` with coefficients of the motion's frames instead of a regressor's: a take's own projections, or edited
     ones."""
+    require_apart(_motion_files(output), [poses, wearer.body])
     known = load_garment_model(model, with_lstm=False)
     scene = _scene(known, poses, wearer, config)
     expected = (len(scene.motion.frame_ids), len(known.model.std))
@@ -204,9 +208,15 @@ def _open(output: Path, scene: _Scene, config: AnimateConfig, regressor: str, ov
         sources=scene.sources,
         overwrite=overwrite,
     )
-    save_body(output / "body" / "body.npz", scene.person.body)
-    save_poses(output / "body" / "poses.npz", scene.motion)
+    body, poses = _motion_files(output)
+    save_body(body, scene.person.body)
+    save_poses(poses, scene.motion)
     return stage
+
+
+def _motion_files(output: Path) -> tuple[Path, Path]:
+    """Who moves, and how."""
+    return output / "body" / "body.npz", output / "body" / "poses.npz"
 
 
 # --- frames ------------------------------------------------------------------------------------------------------

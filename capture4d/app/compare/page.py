@@ -18,7 +18,6 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-import jinja2
 import numpy as np
 import torch
 
@@ -26,8 +25,10 @@ from capture4d.app.compare.config import CompareConfig
 from capture4d.app.compare.inputs import open_inputs
 from capture4d.app.compare.measures import Row, measure, true_vertices
 from capture4d.app.compare.methods import methods
-from capture4d.app.compare.pictures import ERROR_DEG, Pictures, draw
-from capture4d.app.drawing.panels import Panel, colour_bar, write_panel
+from capture4d.app.compare.pictures import Pictures, draw
+from capture4d.app.compare.table import LEARNED, comparison_table
+from capture4d.app.drawing.page import render_page
+from capture4d.app.drawing.panels import Panel, write_panel
 from capture4d.captures.truth import read_truth_model
 from capture4d.captures.work_folder import WorkFolder
 from capture4d.files.atomic import write_bytes, write_json
@@ -133,9 +134,19 @@ def _write_page(
         left_out: what would have a row if it had been learned, and the command that learns it.
         count: held-out frames.
     """
-    environment = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True)
-    page = environment.get_template("compare.html.jinja").render(
-        name=name, rows=table, frames=pictures.frames, count=count, against_truth=against_truth, error_deg=ERROR_DEG,
-        bar=colour_bar(ERROR_DEG), people=pictures.people, middle=pictures.people_frame, left_out=left_out,
-    )  # fmt: skip
+    against = "the true positions" if against_truth else "the registration"
+    page = render_page(
+        "capture4d.app.compare",
+        "compare.html.jinja",
+        title=f"{name}: surfaces compared",
+        subtitle=f"On {count} held-out frames. Normals are measured against the maps of the scans; vertices against "
+        f"{against}. Speed is one frame at a time, not a batch.",
+        table=comparison_table([asdict(row) for row in table]),
+        learned=LEARNED if any(row.learned for row in table) else "",
+        frames=pictures.frames,
+        scale=pictures.scale,
+        people=pictures.people,
+        middle=pictures.people_frame,
+        left_out=left_out,
+    )
     write_bytes(path, page.encode())

@@ -11,7 +11,7 @@ import torch
 from capture4d.app.compare.garment import Modelled
 from capture4d.app.compare.methods import NETWORK, Method, Surfaces
 from capture4d.app.drawing.palette import CLOTH, HEIGHT, SKIN, WIDTH
-from capture4d.app.drawing.panels import Framing, Panel, data_uri, no_scan, readable_scan
+from capture4d.app.drawing.panels import Framing, Panel, Scale, data_uri, no_scan, readable_scan
 from capture4d.app.drawing.render import Drawn, View, heat_colours, render
 from capture4d.captures.capture import Capture
 from capture4d.captures.truth import TruthModel, read_truth_vertices
@@ -20,10 +20,10 @@ from wrinkles.normal_maps.metrics import angles
 from wrinkles.normal_maps.pairs import PairTake
 from wrinkles.normal_maps.template import MapTemplate
 
-__all__ = ["ERROR_DEG", "FramePictures", "Pictures", "draw"]
+__all__ = ["FramePictures", "Pictures", "draw"]
 
 ERROR_DEG = 30.0
-"""Normal error at which the strip's colours saturate."""
+"""Normal error at which the strip's colours end."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,6 +43,8 @@ class Pictures:
     frames: Sequence[FramePictures]
     people: Sequence[Panel]
     people_frame: int
+    scale: Scale
+    """Of the angles in the strips."""
 
 
 def draw(
@@ -64,16 +66,16 @@ def draw(
     """
     total = len(held.frame_ids)
     chosen = np.unique(np.linspace(0, total - 1, min(count, total)).astype(int)).tolist()
-    frames = [
-        FramePictures(
-            int(held.frame_ids[at]),
-            _Frame(surfaces, template, held, at).panels(capture, truth),
-            _strip(template, surfaces.methods, held, at),
-        )
-        for at in chosen
-    ]
+    frames, drawn = [], []
+    for at in chosen:
+        angle_of = _map_errors(template, surfaces.methods, held, at)
+        strip = [Panel(name, _heat(angle)) for name, angle in angle_of.items()]
+        panels = _Frame(surfaces, template, held, at).panels(capture, truth)
+        frames.append(FramePictures(int(held.frame_ids[at]), panels, strip))
+        drawn += [angle[np.isfinite(angle)] for angle in angle_of.values()]
     people = [] if surfaces.modelled is None else _people(surfaces.modelled, middle)
-    return Pictures(frames, people, int(held.frame_ids[total // 2]))
+    scale = Scale.ending("angle", ERROR_DEG, np.concatenate(drawn), "deg")
+    return Pictures(frames, people, int(held.frame_ids[total // 2]), scale)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,16 +143,19 @@ class _Frame:
         return self.template.tangent_image(normals, self.template.frames(vertices)).astype(np.float32)
 
 
-def _strip(template: MapTemplate, methods: Sequence[Method], held: PairTake, at: int) -> list[Panel]:
-    """The angle of every method's normals to the scan's, in the map."""
+def _map_errors(template: MapTemplate, methods: Sequence[Method], held: PairTake, at: int) -> dict[str, np.ndarray]:
+    """The angle of every method's normals to the scan's, in the map, degrees; NaN where the scan says nothing."""
     rotation, valid = template.rotation(methods[0].vertices[at]), held.valid[at].numpy()[0]
-    panels = []
+    errors = {}
     for method in methods:
         image = template.raster.image((method.normals[at] @ rotation).astype(np.float32))
         angle = angles(torch.from_numpy(image).permute(2, 0, 1)[None], held.high[at].float()[None])[0, 0].numpy()
-        colours = heat_colours(np.where(valid, angle, np.nan).ravel(), high=ERROR_DEG).reshape(*angle.shape, 3)
-        panels.append(Panel(method.name, data_uri(colours)))
-    return panels
+        errors[method.name] = np.where(valid, angle, np.nan)
+    return errors
+
+
+def _heat(angle: np.ndarray) -> str:
+    return data_uri(heat_colours(angle.ravel(), high=ERROR_DEG).reshape(*angle.shape, 3))
 
 
 def _people(modelled: Modelled, row: int) -> list[Panel]:

@@ -9,7 +9,7 @@ from html import escape
 
 import numpy as np
 
-__all__ = ["Line", "line_chart", "nice_ticks"]
+__all__ = ["Line", "joined_chart", "line_chart", "nice_ticks"]
 
 WIDTH, HEIGHT = 560, 220
 LEFT, RIGHT, TOP, BOTTOM = 44, 12, 12, 26
@@ -60,6 +60,13 @@ def line_chart(frames: Sequence[int], lines: Sequence[Line], *, floor: float = 0
     parts.append("</svg>")
     legend = "".join(f'<li><i style="background:{line.colour}"></i>{escape(line.name)}</li>' for line in lines)
     return f'{"".join(parts)}<ul class="legend">{legend}</ul>'
+
+
+def joined_chart(frames: Sequence[int], lines: Sequence[Line], *, floor: float = 0.0) -> str:
+    """The same without the frames that have no value, so that measures taken on every n-th frame join up."""
+    kept = np.flatnonzero(np.any([np.isfinite(line.values) for line in lines], axis=0))
+    shorter = [Line(line.name, line.values[kept], line.colour) for line in lines]
+    return line_chart([frames[row] for row in kept.tolist()], shorter, floor=floor)
 
 
 def nice_ticks(low: float, high: float, *, count: int = 5) -> list[float]:

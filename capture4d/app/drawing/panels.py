@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import base64
 import io
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float, Float32, UInt8
 from PIL import Image
 
 from capture4d.app.drawing.palette import CLOTH, HEIGHT, LOOP, WIDTH
@@ -24,12 +26,14 @@ __all__ = [
     "VIEWS",
     "Framing",
     "Panel",
+    "Scale",
     "colour_bar",
     "data_uri",
     "draw_frame",
     "no_scan",
     "read_panel",
     "readable_scan",
+    "round_up",
     "write_panel",
 ]
 
@@ -59,6 +63,51 @@ class Panel:
     uri: str
 
 
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """What the colours of errors mean: 0 to `high`, and what is clipped beyond."""
+
+    title: str
+    high: float
+    unit: str
+    clip: str
+    """How much of what is drawn lies beyond, in words."""
+
+    @staticmethod
+    def covering(title: str, values: Float[np.ndarray, "..."], unit: str) -> Scale:
+        """A scale for all of these values but the last per cent; NaN is no value."""
+        found = np.asarray(values, float)
+        found = found[np.isfinite(found)]
+        if not len(found):
+            return Scale(title, 1.0, unit, "")
+        return Scale.ending(title, round_up(float(np.percentile(found, 99))), found, unit)
+
+    @staticmethod
+    def ending(title: str, high: float, values: Float[np.ndarray, "..."], unit: str) -> Scale:
+        """A scale from 0 to `high`, of which it is said what of these values it leaves out."""
+        found = np.asarray(values, float)
+        found = found[np.isfinite(found)]
+        beyond = found[found > high]
+        clip = f"{100 * len(beyond) / len(found):.2g} % beyond, up to {beyond.max():.3g} {unit}" if len(beyond) else ""
+        return Scale(title, high, unit, clip)
+
+    @property
+    def end(self) -> str:
+        """The number at its end."""
+        return f"{self.high:g} {self.unit}"
+
+    @property
+    def uri(self) -> str:
+        """A strip of its colours."""
+        return colour_bar(self.high)
+
+
+def round_up(value: float) -> float:
+    """The next of 1, 2 and 5 times a power of ten."""
+    power = 10.0 ** math.floor(math.log10(max(value, 1e-3)))
+    return next(factor * power for factor in (1, 2, 5, 10) if factor * power >= value * 0.999)
+
+
 def readable_scan(capture: Capture, frame_id: int) -> Scan | None:
     """The scan of a frame; None if it cannot be read, which is no news: extraction has flagged the frame."""
     try:
@@ -78,20 +127,20 @@ def draw_frame(
     vertices: Float32[np.ndarray, "verts 3"],
     framing: Framing,
     *,
-    errors_mm: dict[str, tuple[np.ndarray, float]],
-    border_colours: dict[str, Colour],
-) -> list[list[Panel]]:
-    """Pictures of one frame: a row for each of VIEWS.
+    errors_mm: Mapping[str, tuple[np.ndarray, Scale]],
+    border_colours: Mapping[str, Colour],
+) -> list[Panel]:
+    """Pictures of one frame: from each of VIEWS the scan, the registration, and its errors.
 
     Args:
         scan: None if it cannot be read.
-        errors_mm: per-vertex errors by title, each with the value at which its colours saturate.
+        errors_mm: per-vertex errors by title, each with its colours.
         border_colours: paint of the loops; loops without are drawn orange.
     """
     mesh = garment.template.with_vertices(vertices)
     paints = {"registration": _cloth(garment, border_colours)}
-    paints |= {title: heat_colours(values, high=high) for title, (values, high) in errors_mm.items()}
-    rows = []
+    paints |= {title: heat_colours(values, high=scale.high) for title, (values, scale) in errors_mm.items()}
+    drawn = []
     for direction in VIEWS:
         view = framing.view(vertices, direction)
         scanned = no_scan()
@@ -99,9 +148,8 @@ def draw_frame(
             picture = render([Drawn(scan.mesh, scan.colours)], view, width=WIDTH, height=HEIGHT)
             scanned = Panel("scan", data_uri(picture))
         traced = trace([mesh], view, width=WIDTH, height=HEIGHT)
-        panels = [Panel(title, data_uri(traced.painted([colours]))) for title, colours in paints.items()]
-        rows.append([scanned, *panels])
-    return rows
+        drawn += [scanned, *(Panel(title, data_uri(traced.painted([colours]))) for title, colours in paints.items())]
+    return drawn
 
 
 def colour_bar(high: float) -> str:
@@ -126,7 +174,7 @@ def read_panel(path: Path, title: str) -> Panel:
     return Panel(title, WEBP + base64.b64encode(path.read_bytes()).decode())
 
 
-def _cloth(garment: Garment, border_colours: dict[str, Colour]) -> np.ndarray:
+def _cloth(garment: Garment, border_colours: Mapping[str, Colour]) -> np.ndarray:
     colours = np.tile(np.array(CLOTH, np.uint8), (len(garment.template.vertices), 1))
     for name, loop in garment.loops.items():
         colours[loop] = border_colours.get(name, LOOP)

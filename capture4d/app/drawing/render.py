@@ -16,7 +16,7 @@ from capture4d.geometry.tangents import TangentLayout, interpolated_frames
 from capture4d.geometry.uv_raster import sample_bilinear
 from capture4d.types import Mesh
 
-__all__ = ["Direction", "Drawn", "Traced", "View", "frame_view", "heat_colours", "render", "trace"]
+__all__ = ["BEYOND", "NO_DATA", "Direction", "Drawn", "Traced", "View", "frame_view", "heat_colours", "render", "trace"]
 
 Direction = Literal["front", "back", "left", "right", "three_quarter", "three_quarter_back"]
 AZIMUTH_DEG: dict[Direction, float] = {
@@ -30,6 +30,8 @@ AZIMUTH_DEG: dict[Direction, float] = {
 """Angle of the camera about the Y axis: 0 looks at the subject's face (from +Z), 90 at the subject's left (from +X)."""
 
 NO_DATA = (168, 172, 178)
+BEYOND = (0, 176, 200)
+"""Of values beyond the end of a scale: a hue that the scale does not have, so that clipped values stand out."""
 # Matplotlib's perceptually uniform "magma" (CC0), from its light end: good values are pale, so that the shading of the
 # folds stays visible.
 HEAT = np.array(
@@ -124,11 +126,14 @@ def frame_view(
 
 
 def heat_colours(values: Float[np.ndarray, " verts"], *, low: float = 0.0, high: float) -> UInt8[np.ndarray, "verts 3"]:
-    """Colours of scalars: pale at `low`, through orange to dark violet at `high` and above; NaN, no data, is grey."""
-    share = np.clip((np.asarray(values, float) - low) / (high - low), 0, 1)
+    """Colours of scalars: pale at `low`, through orange to dark violet at `high`; what is beyond is turquoise, and NaN,
+    no data, grey."""
+    place = (np.asarray(values, float) - low) / (high - low)
+    share = np.clip(place, 0, 1)
     missing = np.isnan(share)
     position = np.where(missing, 0, share) * (len(HEAT) - 1)
     colours = np.stack([np.interp(position, np.arange(len(HEAT)), channel) for channel in HEAT.T], axis=-1)
+    colours[place > 1] = BEYOND
     colours[missing] = NO_DATA
     return (colours + 0.5).astype(np.uint8)
 

@@ -6,18 +6,19 @@ import platform
 from collections.abc import Mapping, Sequence
 from functools import partial
 from importlib.metadata import version
-from itertools import groupby
 from typing import Any
 
-import jinja2
 import numpy as np
 
-from capture4d.app.drawing.charts import Line
+from capture4d.app.drawing.charts import Line, joined_chart
+from capture4d.app.drawing.page import Badge, Chart, Tile, render_page
 from capture4d.app.drawing.palette import BLUE, CLOTH, GREEN, GREY, HEIGHT, ORANGE, SKIN, WIDTH
 from capture4d.app.drawing.panels import VIEWS, Framing, Panel, data_uri
 from capture4d.app.drawing.render import Drawn, render
+from capture4d.app.report.flagged import FLAGGED_NOTE, flagged_table, verdict_counts, verdict_runs
 from capture4d.app.report.metrics import column, shown
-from capture4d.app.report.take import MAX_FLAGGED_ROWS, flat, is_current, joined_chart, spread
+from capture4d.app.report.take import is_current, spread
+from capture4d.app.report.take_page import flat, metrics_table
 from capture4d.body.skinning import pose_frame, with_shape
 from capture4d.captures.work_folder import ANIMATE, VERDICTS, WorkFolder
 from capture4d.files.atomic import write_bytes, write_json
@@ -26,7 +27,7 @@ from capture4d.runs.workers import run_jobs, shared
 
 __all__ = ["ANIMATION_METRICS", "run"]
 
-SCHEMA = 1
+SCHEMA = 2
 PICTURES = 8
 
 ANIMATION_METRICS: Mapping[str, tuple[str, str, str]] = {
@@ -89,7 +90,7 @@ def summarise(records: Sequence[Mapping[str, Any]]) -> dict[str, float]:
             if key in special or key in records[0]}  # fmt: skip
 
 
-def _draw_row(work: WorkFolder, row: int, *, framing: Framing) -> tuple[int, list[list[Panel]]]:
+def _draw_row(work: WorkFolder, row: int, *, framing: Framing) -> tuple[int, list[Panel]]:
     """The garment on the body, from both sides."""
     sequence, (body, poses) = work.registered, work.require_posed_body()
     vertices = np.array(sequence.vertices[row])
@@ -100,7 +101,7 @@ def _draw_row(work: WorkFolder, row: int, *, framing: Framing) -> tuple[int, lis
     ]
     views = [framing.view(vertices, direction) for direction in VIEWS]
     return row, [
-        [Panel(direction.replace("_", " "), data_uri(render(drawn, view, width=WIDTH, height=HEIGHT)))]
+        Panel(direction.replace("_", " "), data_uri(render(drawn, view, width=WIDTH, height=HEIGHT)))
         for direction, view in zip(VIEWS, views, strict=True)
     ]
 
@@ -109,23 +110,19 @@ def _page(
     work: WorkFolder,
     records: Sequence[Mapping[str, Any]],
     summary: Mapping[str, float],
-    pictures: Mapping[int, list[list[Panel]]],
+    pictures: Mapping[int, Sequence[Panel]],
 ) -> str:
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("capture4d.app.report", "."), autoescape=True, undefined=jinja2.StrictUndefined
-    )
-    flagged = [record for record in records if record["verdict"] != "good"]
-    counts = {verdict: sum(record["verdict"] == verdict for record in records) for verdict in VERDICTS}
     stage, poses = work.stages["registration"], work.require_posed_body()[1]
     template = work.registered.garment.template
-    return environment.get_template("report.html.jinja").render(
+    return render_page(
+        "capture4d.app.report",
+        "report.html.jinja",
         title=work.path.resolve().name,
         subtitle=f"{len(records)} frames, {len(records) / poses.fps:.1f} s at {poses.fps:g} fps; a learned garment of "
         f"{len(template.vertices):,} vertices on a body of shape "
         f"{', '.join(f'{value:.2g}' for value in poses.shape[:4])}.",
-        version=version("capture4d"),
         tiles=[
-            {"name": name, "value": shown(summary[key]), "unit": ANIMATION_METRICS[key][0]}
+            Tile(shown(summary[key]), ANIMATION_METRICS[key][0], name)
             for key, name in (
                 ("frames_good_percent", "frames are good"),
                 ("inside_before_percent", "was inside the body"),
@@ -134,41 +131,33 @@ def _page(
                 ("pose_distance_deg", "to the nearest learned pose"),
             )
         ],
-        strip=[(verdict, len(list(group))) for verdict, group in groupby(record["verdict"] for record in records)],
-        verdicts=[(verdict, count) for verdict, count in counts.items() if count],
-        flagged_columns=("pose distance, deg", "inside, %"),
-        flagged=[
-            {
-                "frame_id": record["frame_id"],
-                "verdict": record["verdict"],
-                "reasons": "; ".join(record["reasons"]),
-                "shown": [shown(record["pose_distance_deg"]), shown(record["inside_body_percent"])],
-            }
-            for record in flagged[:MAX_FLAGGED_ROWS]
-        ],
-        flagged_left_out=max(0, len(flagged) - MAX_FLAGGED_ROWS),
+        strip=verdict_runs(records),
+        verdicts=verdict_counts(records, VERDICTS),
+        flagged=flagged_table(
+            records, measures=(("pose distance, deg", "pose_distance_deg"), ("inside, %", "inside_body_percent"))
+        ),
+        flagged_note=FLAGGED_NOTE,
+        regions=None,
         charts=_charts(records),
-        columns=2,
+        columns=4,
         calibration=None,
         comparison=None,
         tracking=None,
         extraction=[],
         tracked=[],
         scales=[],
+        films=[],
         pictures_note="The garment on the body, from the front and from behind.",
         frames=[
             {
                 "frame_id": records[row]["frame_id"],
-                "verdict": records[row]["verdict"],
+                "verdict": Badge(records[row]["verdict"]),
                 "caption": "; ".join(records[row]["reasons"]),
-                "rows": panels,
+                "panels": panels,
             }
             for row, panels in sorted(pictures.items())
         ],
-        metrics=[
-            {"key": key, "shown": shown(value), "unit": ANIMATION_METRICS[key][0], "meaning": ANIMATION_METRICS[key][2]}
-            for key, value in summary.items()
-        ],
+        metrics=metrics_table(summary, ANIMATION_METRICS),
         run=[
             ("Model", stage["sources"]["model"]),
             ("Motion", stage["sources"]["poses"]),
@@ -181,7 +170,7 @@ def _page(
     )
 
 
-def _charts(records: Sequence[Mapping[str, Any]]) -> Sequence[dict[str, str]]:
+def _charts(records: Sequence[Mapping[str, Any]]) -> Sequence[Chart]:
     frames = [int(record["frame_id"]) for record in records]
     inside = (("before", "inside_before_percent", GREY), ("after", "inside_body_percent", BLUE))
     distance = (("pose", "pose_distance_deg", ORANGE), ("limit", "unlike_deg", GREY))
@@ -194,5 +183,5 @@ def _charts(records: Sequence[Mapping[str, Any]]) -> Sequence[dict[str, str]]:
     charts = []
     for title, curves in wanted:
         lines = [Line(name, column(records, key), tint) for name, key, tint in curves]
-        charts.append({"title": title, "svg": joined_chart(frames, lines, 0.0)})
+        charts.append(Chart(title, joined_chart(frames, lines)))
     return charts

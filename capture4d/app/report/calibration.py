@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
 from rich.console import Console
-from rich.table import Table
+from rich.table import Table as TerminalTable
 
 from capture4d.app.drawing.charts import Line, line_chart
+from capture4d.app.drawing.page import Chart, Column, Table, Tile, render_page
 from capture4d.app.drawing.palette import BLUE, GREY, ORANGE
 from capture4d.calibration.check import CameraCheck
 from capture4d.files.atomic import write_bytes
@@ -38,6 +37,15 @@ _COLUMNS: tuple[tuple[str, str, str], ...] = (
     ("focal_sigma_px", "± focal px", ".2f"),
 )
 """Of a camera: entry in calibration.json, heading, format."""
+_HELD_OUT: tuple[tuple[str, str, str], ...] = (
+    ("cameras", "cameras", "d"),
+    ("median_px", "median px", ".3f"),
+    ("rms_px", "rms px", ".3f"),
+    ("corner_median_mm", "corners, median mm", ".3f"),
+    ("corner_rms_mm", "corners, rms mm", ".3f"),
+    ("scale_ppm", "scale, ppm", ".0f"),
+)
+"""The same of a pose held out; nothing was triangulated where the last three are None."""
 _ON_TERMINAL = ("poses", "median_px", "coverage_percent", "centre_sigma_mm", "rotation_sigma_deg")
 _MOVEMENT = ("verdict", "score", "shift px", "translation mm", "rotation deg")
 
@@ -45,7 +53,7 @@ _MOVEMENT = ("verdict", "score", "shift px", "translation mm", "rotation deg")
 def print_calibration(report: Mapping[str, Any]) -> None:
     """The table of cameras, the figures of the whole, and what to film next."""
     columns = [column for column in _COLUMNS if column[0] in _ON_TERMINAL]
-    table = Table("camera", *(heading for _, heading, _ in columns))
+    table = TerminalTable("camera", *(heading for _, heading, _ in columns))
     for column in table.columns[1:]:
         column.justify = "right"
     for row in report["cameras"]:
@@ -60,7 +68,7 @@ def print_calibration(report: Mapping[str, Any]) -> None:
 
 def print_check(checks: Sequence[CameraCheck]) -> None:
     """One line a camera; what has moved stands out."""
-    table = Table("camera", *_MOVEMENT)
+    table = TerminalTable("camera", *_MOVEMENT)
     for check in checks:
         if check.verdict == "unseen":
             table.add_row(check.name, "unseen", *[""] * 4, style="dim")
@@ -85,13 +93,12 @@ def write_page(path: Path, report: Mapping[str, Any]) -> Path:
 
 def calibration_page(report: Mapping[str, Any]) -> str:
     """The HTML of a calibration.json."""
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("capture4d.app.report", "."), autoescape=True, undefined=jinja2.StrictUndefined
-    )
     names = [row["name"] for row in report["cameras"]]
     counts = f"{len(names)} cameras, {len(report['poses'])} poses, {report['corners']:,} corners"
-    return environment.get_template("calibration.html.jinja").render(
-        version=version("capture4d"),
+    return render_page(
+        "capture4d.app.report",
+        "calibration.html.jinja",
+        title="Rig calibration",
         subtitle=f"{counts}; {report['board']}",
         tiles=calibration_tiles(report),
         advice=report["advice"],
@@ -108,28 +115,37 @@ def calibration_page(report: Mapping[str, Any]) -> str:
         names=names,
         shared=report["shared_poses"],
         most_shared=max(1, max(max(row) for row in report["shared_poses"])),
-        hold_out=report["hold_out"],
+        hold_out=_held_out(report["hold_out"]),
         summary=_summary(report),
     )
 
 
-def calibration_tiles(report: Mapping[str, Any]) -> list[tuple[str, str, str]]:
-    """(value, unit, what it is) of the figures that matter most."""
+def _held_out(poses: Sequence[Mapping[str, Any]]) -> Table:
+    """How the rig sees poses that it was not calibrated with."""
+    columns = [Column("pose"), *(Column(heading, number=True) for _, heading, _ in _HELD_OUT)]
+    return Table(columns, [
+        [row["name"], *("" if row[key] is None else format(row[key], shape) for key, _, shape in _HELD_OUT)]
+        for row in poses
+    ])  # fmt: skip
+
+
+def calibration_tiles(report: Mapping[str, Any]) -> list[Tile]:
+    """The figures that matter most."""
     sigmas = [row["centre_sigma_mm"] for row in report["cameras"]]
     tiles = [
-        (f"{report['residual_median_px']:.3f}", "px", "residual, median"),
-        (f"{np.median(sigmas):.3f}", "mm", "uncertainty of a camera's place, median"),
-        (f"{max(sigmas):.3f}", "mm", "the same, worst camera"),
-        (f"{min(row['coverage_percent'] for row in report['cameras']):.0f}", "%", "least coverage of an image"),
+        Tile(f"{report['residual_median_px']:.3f}", "px", "residual, median"),
+        Tile(f"{np.median(sigmas):.3f}", "mm", "uncertainty of a camera's place, median"),
+        Tile(f"{max(sigmas):.3f}", "mm", "the same, worst camera"),
+        Tile(f"{min(row['coverage_percent'] for row in report['cameras']):.0f}", "%", "least coverage of an image"),
     ]
     held = [row["corner_rms_mm"] for row in report["hold_out"] if row["corner_rms_mm"] is not None]
     if held:
-        tiles.append((f"{np.median(held):.3f}", "mm", "corners triangulated at poses held out"))
+        tiles.append(Tile(f"{np.median(held):.3f}", "mm", "corners triangulated at poses held out"))
     return tiles
 
 
-def calibration_charts(report: Mapping[str, Any]) -> list[dict[str, str]]:
-    """Titles and SVGs of the curves over the poses, by their numbers if that is what they are called."""
+def calibration_charts(report: Mapping[str, Any]) -> list[Chart]:
+    """Curves over the poses, by their numbers if that is what they are called."""
     names = [row["name"] for row in report["poses"]]
     numbered = all(name.isdecimal() for name in names)
     poses = [int(name) for name in names] if numbered else list(range(len(names)))
@@ -137,13 +153,13 @@ def calibration_charts(report: Mapping[str, Any]) -> list[dict[str, str]]:
         Line("median", np.array([row["median_px"] for row in report["poses"]]), BLUE),
         Line("root mean square", np.array([row["rms_px"] for row in report["poses"]]), GREY),
     ]
-    charts = [{"title": "Residual by pose, px", "svg": line_chart(poses, residuals)}]
+    charts = [Chart("Residual by pose, px", line_chart(poses, residuals))]
     by_name = {row["name"]: row["corner_rms_mm"] for row in report["volume"]}
     values = [by_name.get(row["name"]) for row in report["poses"]]
     errors = np.array([np.nan if value is None else value for value in values])
     if np.isfinite(errors).any():
         lines = [Line("triangulated corners to the board, root mean square", errors, ORANGE)]
-        charts.append({"title": "The board as measured, by pose, mm", "svg": line_chart(poses, lines)})
+        charts.append(Chart("The board as measured, by pose, mm", line_chart(poses, lines)))
     return charts
 
 

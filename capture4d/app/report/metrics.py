@@ -23,7 +23,7 @@ from capture4d.captures.truth import TruthModel
 from capture4d.captures.work_folder import VERDICTS
 from capture4d.types import RegisteredSequence
 
-__all__ = ["METRICS", "column", "shown", "summarise", "truth_measures"]
+__all__ = ["METRICS", "column", "own_measures", "shown", "summarise", "truth_measures"]
 
 METRICS: Mapping[str, tuple[str, str, str]] = {
     "fit_mean_mm": ("mm", "lower", "template vertices to the scan's surface, where it has data"),
@@ -108,6 +108,28 @@ def truth_measures(
             measures[f"{name}_mean_mm"] = 1e3 * float(errors.mean())
             measures[f"{name}_p95_mm"] = 1e3 * float(np.percentile(errors, 95))
     return measures
+
+
+def own_measures(
+    records: Sequence[Mapping[str, Any]],
+    registered: Sequence[Mapping[str, Any]],
+    tracked: Sequence[Mapping[str, Any]] = (),
+) -> list[dict[str, Any]]:
+    """What the report alone has measured of each frame, against the truth, for who compares reports.
+
+    Args:
+        records: the frames' records with all measures; `registered`, those that the registration has written.
+        tracked: tracking's records, with the measures of joints.
+    """
+    joints = {record["frame_id"]: record for record in tracked}
+    rows = []
+    for record, written in zip(records, registered, strict=True):
+        found = {key: value for key, value in record.items() if key not in written}
+        joint = joints.get(record["frame_id"], {})
+        found |= {key: joint[key] for key in ("joint_mean_mm", "joint_max_mm") if key in joint}
+        if found:
+            rows.append({"frame_id": record["frame_id"], **found})
+    return rows
 
 
 def column(records: Sequence[Mapping[str, Any]], key: str) -> np.ndarray:

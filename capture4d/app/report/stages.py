@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from capture4d.app.drawing.charts import Line, line_chart
+from capture4d.app.drawing.page import Chart, Tile
 from capture4d.app.drawing.palette import BLUE, BODY, GREEN, GREY, HEIGHT, ORANGE, WIDTH
 from capture4d.app.drawing.panels import VIEWS, Framing, Panel, data_uri, no_scan, read_panel, readable_scan
 from capture4d.app.drawing.render import Drawn, render
@@ -55,10 +56,10 @@ POINT_M = 0.006
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Section:
-    """Tiles (value, unit, name), charts (title, svg) and whatever else a part of the page shows."""
+    """Figures and curves of a part of the page."""
 
-    tiles: Sequence[tuple[str, str, str]]
-    charts: Sequence[Mapping[str, str]]
+    tiles: Sequence[Tile]
+    charts: Sequence[Chart]
 
 
 # --- calibration -------------------------------------------------------------------------------------------------
@@ -87,9 +88,9 @@ def calibration(capture: Capture, work: Path) -> Calibration | None:
     away = np.linalg.norm(rig.centres - rig.centres.mean(axis=0), axis=1)
     sizes = sorted({(int(width), int(height)) for width, height in rig.image_sizes})
     tiles = [
-        (f"{len(rig.names)}", "", "cameras"),
-        (" ".join(f"{width}x{height}" for width, height in sizes[:2]), "px", "images"),
-        (f"{away.min():.2f} to {away.max():.2f}", "m", "from the middle of the rig"),
+        Tile(f"{len(rig.names)}", "", "cameras"),
+        Tile(" ".join(f"{width}x{height}" for width, height in sizes[:2]), "px", "images"),
+        Tile(f"{away.min():.2f} to {away.max():.2f}", "m", "from the middle of the rig"),
     ]
     note = "From rig.json; how certain it is, nothing here says. capture4d calibrate writes calibration.json beside it."
     return Calibration(Section(tiles, []), note)
@@ -150,9 +151,6 @@ class Tracking:
     unseen: Sequence[tuple[str, int]]
     """Limbs that were not scanned, and in how many frames; most often first."""
 
-    def flagged(self) -> list[Mapping[str, Any]]:
-        return [record for record in self.records if record["verdict"] != "good"]
-
 
 def tracking(capture: Capture, work: Path) -> Tracking | None:
     """What tracking says about its frames, beside the truth if the capture has it."""
@@ -181,7 +179,7 @@ def tracking(capture: Capture, work: Path) -> Tracking | None:
         "joint_mean_mm": ("mm", "joints to their true places"),
         "track_cpu_s": ("s", "CPU a frame, median"),
     }
-    tiles = [(shown(metrics[key]), unit, name) for key, (unit, name) in names.items() if key in metrics]
+    tiles = [Tile(shown(metrics[key]), unit, name) for key, (unit, name) in names.items() if key in metrics]
     unseen = Counter(limb for record in records for limb in record["unseen"]).most_common()
     return Tracking(Section(tiles, list(_tracking_charts(records))), records, metrics, unseen)
 
@@ -206,7 +204,7 @@ def _measure_joints(folder: Path, truth: PoseSequence, records: Sequence[dict[st
         record["joint_mean_mm"], record["joint_max_mm"] = float(errors.mean()), float(errors.max())
 
 
-def _tracking_charts(records: Sequence[Mapping[str, Any]]) -> Sequence[Mapping[str, str]]:
+def _tracking_charts(records: Sequence[Mapping[str, Any]]) -> Sequence[Chart]:
     frames = [int(record["frame_id"]) for record in records]
     wanted = (
         ("Skin and suit to the body, mm", (("median", "median_mm", BLUE),)),
@@ -218,7 +216,7 @@ def _tracking_charts(records: Sequence[Mapping[str, Any]]) -> Sequence[Mapping[s
     for title, curves in wanted:
         lines = [Line(name, column(records, key), colour) for name, key, colour in curves]
         if any(np.isfinite(line.values).any() for line in lines):
-            charts.append({"title": title, "svg": line_chart(frames, lines)})
+            charts.append(Chart(title, line_chart(frames, lines)))
     return charts
 
 

@@ -1,92 +1,39 @@
 """The report of a work folder: WORK/report/index.html, self-contained, and WORK/report/metrics.json.
 
+frames.jsonl beside them keeps what is measured here of each frame, against the truth, if there is one.
 docs/reference/report.md defines every metric. Those against truth appear where the capture has one.
 """
 
 from __future__ import annotations
 
 import contextlib
-import math
-import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from importlib.metadata import version
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
 
-from capture4d.app.drawing.charts import Line, line_chart
-from capture4d.app.drawing.palette import BLUE, GREEN, GREY, ORANGE
-from capture4d.app.drawing.panels import Framing, Panel, colour_bar, draw_frame, readable_scan
-from capture4d.app.report.metrics import METRICS, column, shown, summarise, truth_measures
-from capture4d.app.report.stages import (
-    Calibration,
-    Comparison,
-    StagePictures,
-    Tracking,
-    calibration,
-    comparison,
-    comparison_digest,
-    draw_stages,
-    tracking,
-)
+from capture4d.app.drawing.panels import Framing, Panel, Scale, draw_frame, readable_scan
+from capture4d.app.report.metrics import METRICS, own_measures, summarise, truth_measures
+from capture4d.app.report.stages import calibration, comparison, comparison_digest, draw_stages, tracking
+from capture4d.app.report.take_page import Drawings, Stages, take_page
 from capture4d.captures.capture import Capture, read_capture
 from capture4d.captures.evaluation import correspondence_errors, material_points
 from capture4d.captures.truth import TruthModel, read_truth_model, read_truth_vertices
 from capture4d.captures.work_folder import VERDICTS, WorkFolder
 from capture4d.errors import InputError
-from capture4d.files.atomic import write_bytes, write_json
+from capture4d.files.atomic import write_bytes, write_json, write_json_lines
 from capture4d.runs.stage import StageResult, open_stage, read_record, require_complete, result_of
 from capture4d.runs.workers import run_jobs, shared
 from capture4d.settings import Count, settings
 
-__all__ = ["MAX_FLAGGED_ROWS", "ReportConfig", "flat", "is_current", "joined_chart", "run", "spread"]
+__all__ = ["ReportConfig", "is_current", "run", "spread"]
 
-SCHEMA = 3
-MAX_FLAGGED_ROWS = 60
-CURVES: tuple[tuple[str, float, tuple[tuple[str, str, str], ...]], ...] = (
-    (
-        "Fit, mm",
-        0.0,
-        (
-            ("mean", "fit_mean_mm", BLUE),
-            ("95 %", "fit_p95_mm", GREY),
-            ("scan to template", "scan_fit_mean_mm", GREEN),
-        ),
-    ),
-    ("Painted border, mm", 0.0, (("mean", "boundary_mean_mm", BLUE), ("95 %", "boundary_p95_mm", GREY))),
-    (
-        "Against the truth, mm",
-        0.0,
-        (
-            ("correspondence", "correspondence_mean_mm", ORANGE),
-            ("surface", "truth_distance_mean_mm", BLUE),
-            ("border", "border_mean_mm", GREEN),
-        ),
-    ),
-    ("CPU time a frame, s", 0.0, (("registration", "cpu_s", BLUE),)),
-    ("Stretch of edges", 1.0, (("99 %", "stretch_p99", BLUE),)),
-    (
-        "Faces at fault",
-        0.0,
-        (("self-intersecting", "self_intersections", ORANGE), ("flipped", "flipped_faces", BLUE)),
-    ),
-)
-"""Charts: title, start of the vertical axis, and curves (name, metric, colour)."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Stages:
-    """What came before registration, and after."""
-
-    calibration: Calibration | None
-    tracking: Tracking | None
-    pictures: Sequence[StagePictures]
-    comparison: Comparison | None
+SCHEMA = 4
+FIT, CORRESPONDENCE = "fit error", "correspondence error"
+"""Titles of what is drawn as errors."""
 
 
 @settings
@@ -140,9 +87,7 @@ def run(
     summary = summarise(records)
     if tracked is not None:
         summary |= tracked.metrics
-    heat = {"fit error": summary.get("fit_p95_mm"), "correspondence error": summary.get("correspondence_p95_mm")}
-    scales = {title: _round_up(value) for title, value in heat.items() if value is not None}
-    rows = _draw(scene, _drawn_rows(records, config.pictures), scales, workers)
+    drawings = _draw(scene, _drawn_rows(records, config.pictures), workers)
     stages = Stages(
         calibration(scene.capture, work.path),
         tracked,
@@ -160,7 +105,9 @@ def run(
             "frames": len(records),
         },
     )
-    page = _page(scene, records, summary, scales, rows, stages)
+    joints = () if tracked is None else tracked.records
+    write_json_lines(folder / "frames.jsonl", own_measures(records, work.records, joints))
+    page = take_page(work, scene.capture, records, summary, drawings, stages)
     write_bytes(folder / "index.html", page.encode())
     # the report holds times, which differ between equal runs; nothing is made from it
     return stage.finish([], output=folder / "index.html")
@@ -211,39 +158,49 @@ def _measure_row(scene: _Scene, row: int) -> tuple[int, dict[str, float] | str]:
     return row, truth_measures(registered, row, model, vertices)
 
 
-def _draw(scene: _Scene, rows: list[int], scales: Mapping[str, float], workers: int) -> dict[int, list[list[Panel]]]:
+def _draw(scene: _Scene, rows: list[int], workers: int) -> Drawings:
     registered = scene.work.registered
+    errors = [_errors_mm(scene, row) for row in rows]
+    titles = [title for title in (FIT, CORRESPONDENCE) if any(title in each for each in errors)]
+    scales = [
+        Scale.covering(title, np.concatenate([each[title] for each in errors if title in each]), "mm")
+        for title in titles
+    ]
     x, y, z = np.max([np.ptp(vertices, axis=0) for vertices in registered.vertices], axis=0).tolist()
     jobs = [_DrawJob(row, Framing((x, y, z)), scales) for row in rows]
-    return dict(run_jobs(_draw_row, jobs, prepare=shared(scene), workers=workers, label="draw"))
+    drawn = dict(run_jobs(_draw_row, jobs, prepare=shared(scene), workers=workers, label="draw"))
+    return Drawings(drawn, scales, [])
+
+
+def _errors_mm(scene: _Scene, row: int) -> dict[str, np.ndarray]:
+    """What is drawn as errors, by title: (V,) millimetres, NaN where there is no scan data."""
+    registered, model = scene.work.registered, scene.truth
+    errors = {FIT: 1e3 * registered.residual_m[row].astype(float)}
+    if model is not None:
+        with contextlib.suppress(InputError):  # the frame was flagged when it was measured
+            fine = read_truth_vertices(scene.capture, int(registered.frame_ids[row]), model=model)
+            places = material_points(fine, model.fine.faces, model.template_faces, model.template_barycentric)
+            errors[CORRESPONDENCE] = 1e3 * correspondence_errors(np.asarray(registered.vertices[row]), places)
+    return errors
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _DrawJob:
     row: int
     framing: Framing
-    scales: Mapping[str, float]
+    scales: Sequence[Scale]
 
 
-def _draw_row(scene: _Scene, job: _DrawJob) -> tuple[int, list[list[Panel]]]:
-    row, registered, model, capture = job.row, scene.work.registered, scene.truth, scene.capture
-    frame_id, vertices = int(registered.frame_ids[row]), np.array(registered.vertices[row])
-    errors = {}
-    if "fit error" in job.scales:
-        errors["fit error"] = (1e3 * registered.residual_m[row].astype(float), job.scales["fit error"])
-    if model is not None and "correspondence error" in job.scales:
-        with contextlib.suppress(InputError):  # the frame was flagged when it was measured
-            fine = read_truth_vertices(capture, frame_id, model=model)
-            places = material_points(fine, model.fine.faces, model.template_faces, model.template_barycentric)
-            values = 1e3 * correspondence_errors(vertices, places)
-            errors["correspondence error"] = (values, job.scales["correspondence error"])
+def _draw_row(scene: _Scene, job: _DrawJob) -> tuple[int, list[Panel]]:
+    row, registered, capture = job.row, scene.work.registered, scene.capture
+    errors = _errors_mm(scene, row)
     return row, draw_frame(
-        readable_scan(capture, frame_id),
+        readable_scan(capture, int(registered.frame_ids[row])),
         registered.garment,
-        vertices,
+        np.array(registered.vertices[row]),
         job.framing,
-        errors_mm=errors,
-        border_colours=dict(capture.boundary_colours),
+        errors_mm={scale.title: (errors[scale.title], scale) for scale in job.scales if scale.title in errors},
+        border_colours=capture.boundary_colours,
     )
 
 
@@ -259,174 +216,13 @@ def _drawn_rows(records: Sequence[Mapping[str, Any]], count: int) -> list[int]:
 
 
 def spread(total: int, count: int) -> list[int]:
+    """`count` positions among `total`, evenly, from the first to the last."""
     return sorted({round(float(row)) for row in np.linspace(0, total - 1, min(total, count))})
 
 
-# --- page --------------------------------------------------------------------------------------------------------
-
-
-def _page(
-    scene: _Scene,
-    records: Sequence[Mapping[str, Any]],
-    summary: Mapping[str, float | None],
-    scales: Mapping[str, float],
-    pictures: Mapping[int, list[list[Panel]]],
-    stages: Stages,
-) -> str:
-    work, capture = scene.work, scene.capture
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("capture4d.app.report", "."), autoescape=True, undefined=jinja2.StrictUndefined
-    )
-    flagged = [record for record in records if record["verdict"] != "good"]
-    counts = {verdict: sum(record["verdict"] == verdict for record in records) for verdict in VERDICTS}
-    seconds = (capture.frame_ids[-1] - capture.frame_ids[0] + 1) / capture.fps
-    template = work.registered.garment.template
-    return environment.get_template("report.html.jinja").render(
-        title=capture.name,
-        subtitle=f"{len(records)} frames, {seconds:.1f} s at {capture.fps:g} fps; a template of "
-        f"{len(template.vertices):,} vertices registered to every scan.",
-        version=version("capture4d"),
-        tiles=list(_tiles(summary)),
-        strip=[(verdict, len(list(group))) for verdict, group in groupby(record["verdict"] for record in records)],
-        verdicts=[(verdict, count) for verdict, count in counts.items() if count],
-        flagged_columns=("fit mean, mm", "border mean, mm"),
-        pictures_note="Scan, registered template, and errors, from the front and from behind.",
-        flagged=[
-            {
-                "frame_id": record["frame_id"],
-                "verdict": record["verdict"],
-                "reasons": "; ".join(record["reasons"]),
-                "shown": [shown(record.get("fit_mean_mm")), shown(record.get("boundary_mean_mm"))],
-            }
-            for record in flagged[:MAX_FLAGGED_ROWS]
-        ],
-        flagged_left_out=max(0, len(flagged) - MAX_FLAGGED_ROWS),
-        charts=list(_charts(records)),
-        columns=2 + len(scales),
-        calibration=stages.calibration,
-        comparison=stages.comparison,
-        tracking=_tracking_part(stages.tracking),
-        extraction=[{"frame_id": records[each.row]["frame_id"], "panels": each.extraction} for each in stages.pictures],
-        tracked=[
-            {"frame_id": records[each.row]["frame_id"], "panels": each.tracking}
-            for each in stages.pictures
-            if each.tracking
-        ],
-        scales=[{"title": title, "high": f"{high:g}", "uri": colour_bar(high)} for title, high in scales.items()],
-        frames=[
-            {
-                "frame_id": records[row]["frame_id"],
-                "verdict": records[row]["verdict"],
-                "caption": _caption(records[row]),
-                "rows": panels,
-            }
-            for row, panels in sorted(pictures.items())
-        ],
-        metrics=[
-            {"key": key, "shown": shown(value), "unit": METRICS[key][0], "meaning": METRICS[key][2]}
-            for key, value in summary.items()
-        ],
-        run=list(_run_rows(work, capture, records)),
-        settings=list(flat(work.stages["registration"]["config"])),
-    )
-
-
-def _tracking_part(tracked: Tracking | None) -> dict[str, Any] | None:
-    """Tracking as the page shows it."""
-    if tracked is None:
-        return None
-    flagged = tracked.flagged()
-    return {
-        "tiles": tracked.section.tiles,
-        "charts": tracked.section.charts,
-        "flagged": [
-            {"frame_id": each["frame_id"], "verdict": each["verdict"], "reasons": "; ".join(each["reasons"])}
-            for each in flagged[:MAX_FLAGGED_ROWS]
-        ],
-        "left_out": max(0, len(flagged) - MAX_FLAGGED_ROWS),
-        "unseen": [f"{limb} ({count} of {len(tracked.records)} frames)" for limb, count in tracked.unseen],
-    }
-
-
-def _tiles(summary: Mapping[str, float | None]) -> Sequence[dict[str, str]]:
-    names = {
-        "frames_good_percent": "frames are good",
-        "fit_mean_mm": "fit to the scan",
-        "boundary_mean_mm": "painted border",
-        "truth_distance_mean_mm": "distance to the true surface",
-        "correspondence_mean_mm": "correspondence error",
-        "border_mean_mm": "true border",
-        "cpu_s": "CPU a frame, median",
-    }
-    return [
-        {"name": name, "value": shown(summary[key]), "unit": METRICS[key][0]}
-        for key, name in names.items()
-        if key in summary
-    ]
-
-
-def _charts(records: Sequence[Mapping[str, Any]]) -> Sequence[dict[str, str]]:
-    frames = [int(record["frame_id"]) for record in records]
-    charts = []
-    for title, floor, wanted in CURVES:
-        lines = [Line(name, column(records, key), colour) for name, key, colour in wanted if _any(records, key)]
-        if lines:
-            charts.append({"title": title, "svg": joined_chart(frames, lines, floor)})
-    return charts
-
-
-def joined_chart(frames: list[int], lines: list[Line], floor: float) -> str:
-    """Frames without any value are left out, so that measures taken on every n-th frame join up."""
-    kept = np.flatnonzero(np.any([np.isfinite(line.values) for line in lines], axis=0))
-    shorter = [Line(line.name, line.values[kept], line.colour) for line in lines]
-    return line_chart([frames[row] for row in kept], shorter, floor=floor)
-
-
-def _caption(record: Mapping[str, Any]) -> str:
-    named = {"fit": "fit_mean_mm", "border": "boundary_mean_mm", "correspondence": "correspondence_mean_mm"}
-    parts = [f"{name} {shown(record[key])} mm" for name, key in named.items() if record.get(key) is not None]
-    return " · ".join([*parts, *record["reasons"]])
-
-
-def _run_rows(work: WorkFolder, capture: Capture, records: Sequence[Mapping[str, Any]]) -> Sequence[tuple[str, str]]:
-    record, garment = work.stages["registration"], work.registered.garment
-    cpu = column(records, "cpu_s")
-    loops = ", ".join(f"{name} ({len(loop)})" for name, loop in garment.loops.items()) or "none"
-    return [
-        ("Capture", str(capture.path.resolve())),
-        ("Frames", f"{len(records)}, numbers {capture.frame_ids[0]} to {capture.frame_ids[-1]}, {capture.fps:g} fps"),
-        ("Template", f"{len(garment.template.vertices):,} vertices, {len(garment.template.faces):,} faces"),
-        ("Border loops", loops),
-        ("Registered", f"{record.get('started', '')} to {record.get('finished', '')}"),
-        ("CPU time", f"{np.nansum(cpu):.1f} s in all, {np.nanmedian(cpu):.2f} s a frame"),
-        ("Command", f"capture4d run {capture.path} --output {work.path}"),
-        ("Digest", str(record.get("digest", ""))[:16]),
-        ("Versions", ", ".join(f"{name} {version(name)}" for name in ("capture4d", "numpy", "scipy", "open3d"))),
-        ("Machine", f"{platform.system()} {platform.machine()}, Python {platform.python_version()}"),
-    ]
-
-
-# --- small things ------------------------------------------------------------------------------------------------
-
-
 def is_current(folder: Path, current: Mapping[str, Any]) -> bool:
+    """Whether the folder holds a finished report that was made from just this."""
     if not all((folder / name).is_file() for name in ("stage.json", "index.html", "metrics.json")):
         return False
     record = read_record(folder / "stage.json")
     return record.get("status") == "complete" and all(record.get(key) == value for key, value in current.items())
-
-
-def _any(records: Sequence[Mapping[str, Any]], key: str) -> bool:
-    return bool(np.isfinite(column(records, key)).any())
-
-
-def _round_up(value: float) -> float:
-    """The next of 1, 2 and 5 times a power of ten."""
-    power = 10.0 ** math.floor(math.log10(max(value, 1e-3)))
-    return next(factor * power for factor in (1, 2, 5, 10) if factor * power >= value * 0.999)
-
-
-def flat(value: Any, prefix: str = "") -> Sequence[tuple[str, str]]:
-    if not isinstance(value, dict):
-        return [(prefix, str(value))]
-    return [row for key, entry in value.items() for row in flat(entry, f"{prefix}.{key}" if prefix else key)]

@@ -21,7 +21,15 @@ Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Template(MeshOptions):
+class FileOptions:
+    """Of commands whose output is a file among others of the user's."""
+
+    overwrite: bool = False
+    """Write over a file that is there and holds something else than this result; never over an input."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Template(FileOptions, MeshOptions):
     """Make a template of your own garment mesh, or of a part of the body: bound, its borders named, its UVs checked."""
 
     mesh: Annotated[Positional[Path | None], arg(metavar="MESH")] = None
@@ -48,7 +56,9 @@ class Template(MeshOptions):
         from capture4d import pipeline
 
         config = TemplateConfig(self.frame, self.region, self.uv, self.names, self.units)
-        result = pipeline.template(self.mesh, self.output, config, body=self.body, poses=self.poses)
+        result = pipeline.template(
+            self.mesh, self.output, config, body=self.body, poses=self.poses, overwrite=self.overwrite
+        )
         garment, report = result.garment, result.report
         for note in result.notes:
             print(f"capture4d: {self.mesh}: {note}", file=sys.stderr)
@@ -64,7 +74,7 @@ class Template(MeshOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RegisterMesh(MeshOptions):
+class RegisterMesh(FileOptions, MeshOptions):
     """Register any template to any scan, two mesh files; writes the result, and its measures as JSON beside it."""
 
     template: Annotated[Positional[Path], arg(metavar="TEMPLATE")]
@@ -78,7 +88,7 @@ class RegisterMesh(MeshOptions):
     def __call__(self) -> int:
         from capture4d import pipeline
 
-        result = pipeline.register_mesh(self.template, self.scan, self.output, self.config)
+        result = pipeline.register_mesh(self.template, self.scan, self.output, self.config, overwrite=self.overwrite)
         print(f"registered: {self.output}, measures: {self.output.with_suffix('.json')}")
         for note in result.notes:
             print(f"capture4d: {note}", file=sys.stderr)
@@ -90,8 +100,8 @@ class RegisterMesh(MeshOptions):
         return BAD_RESULT if quality.verdict == "failed" else GOOD
 
 
-@dataclass(frozen=True)
-class ConvertBody:
+@dataclass(frozen=True, kw_only=True)
+class ConvertBody(FileOptions):
     """Convert a body model of the SMPL family, from your own licensed file, to a body.npz for captures."""
 
     file: Annotated[Positional[Path], arg(metavar="FILE")]
@@ -101,14 +111,16 @@ class ConvertBody:
 
     def __call__(self) -> int:
         from capture4d.body.smpl import convert_smpl
+        from capture4d.files.outputs import new_files
 
-        convert_smpl(self.file, self.output)
+        with new_files([self.output], inputs=[self.file], overwrite=self.overwrite) as workshop:
+            convert_smpl(self.file, workshop / self.output.name)
         print(f"body: {self.output}")
         return GOOD
 
 
-@dataclass(frozen=True)
-class ConvertRig:
+@dataclass(frozen=True, kw_only=True)
+class ConvertRig(FileOptions):
     """Convert a rig.json to a COLMAP model, or a COLMAP, Metashape or nerfstudio file to a rig.json."""
 
     source: Annotated[Positional[Path], arg(metavar="SOURCE")]
@@ -123,7 +135,7 @@ class ConvertRig:
     def __call__(self) -> int:
         from capture4d.cameras.exchange import convert_rig
 
-        left_out = convert_rig(self.source, self.output, text=self.text, scale=self.scale)
+        left_out = convert_rig(self.source, self.output, text=self.text, scale=self.scale, overwrite=self.overwrite)
         if left_out:
             more = f" and {len(left_out) - 5} more" if len(left_out) > 5 else ""
             print(f"capture4d: {self.source}: left out {', '.join(left_out[:5])}{more}", file=sys.stderr)
@@ -131,8 +143,8 @@ class ConvertRig:
         return GOOD
 
 
-@dataclass(frozen=True)
-class ConvertPoses:
+@dataclass(frozen=True, kw_only=True)
+class ConvertPoses(FileOptions):
     """Convert a motion between poses.npz, AMASS npz and BVH, retargeted to a body where the skeletons differ."""
 
     input: Annotated[Positional[Path], arg(metavar="IN")]
@@ -155,13 +167,16 @@ class ConvertPoses:
 
     def __call__(self) -> int:
         from capture4d.body.anny import load_anny
+        from capture4d.files.outputs import new_files
         from capture4d.files.records import load_body
         from capture4d.motions.clips import MotionWords
         from capture4d.motions.motion_files import read_motion, write_motion
 
         body = load_body(self.body) if self.body else load_anny()
         words = MotionWords.of(self.names, self.up, self.facing)
-        poses = read_motion(self.input, body, fps=self.fps, words=words, say=lambda note: print(f"read: {note}"))
-        write_motion(self.output, body, poses, amass=self.format == "amass")
+        named = Path(self.names) if self.names.lower().endswith(".json") else None
+        with new_files([self.output], inputs=[self.input, self.body, named], overwrite=self.overwrite) as workshop:
+            poses = read_motion(self.input, body, fps=self.fps, words=words, say=lambda note: print(f"read: {note}"))
+            write_motion(workshop / self.output.name, body, poses, amass=self.format == "amass")
         print(f"{len(poses.frame_ids)} poses at {poses.fps:g} fps: {self.output}")
         return GOOD

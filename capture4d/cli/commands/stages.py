@@ -156,6 +156,8 @@ class Report(StageOptions, MeshOptions):
     """Work folder; holds registration/ and gets report/."""
     fail_above: UseAppendAction[tuple[Annotated[str, arg(metavar="METRIC=LIMIT")], ...]] = ()
     """Exit with 3 if this metric of report/metrics.json is above the limit; may be given several times."""
+    fail_below: UseAppendAction[tuple[Annotated[str, arg(metavar="METRIC=LIMIT")], ...]] = ()
+    """Exit with 3 if it is below, likewise: for metrics of which more is better, such as frames_good_percent."""
     capture: Path | None = None
     """Capture folder, if it is not where it was when it was registered."""
 
@@ -163,7 +165,7 @@ class Report(StageOptions, MeshOptions):
         from capture4d import pipeline
         from capture4d.app.report.limits import broken_limits, parse_limits
 
-        limits = parse_limits(self.fail_above)
+        limits = parse_limits(self.fail_above, self.fail_below)
         result = pipeline.report(self.work, capture=self.capture, workers=self.workers, overwrite=self.overwrite)
         print(f"report: {result.path}")
         broken = broken_limits(self.work, limits)

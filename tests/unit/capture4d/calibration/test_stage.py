@@ -108,8 +108,10 @@ def test_corners_are_detected_once(shoot, tmp_path: Path, monkeypatch: pytest.Mo
     np.testing.assert_allclose(first, second, atol=1e-7)
 
 
-def test_what_is_calibrated_is_not_calibrated_again(shoot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Until its images or its files change."""
+def test_what_is_calibrated_is_not_calibrated_again(
+    shoot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """Until its images change, or its files are lost; a rig that somebody has changed since is theirs."""
     folder, _, _ = shoot
     images = shutil.copytree(folder / "images", tmp_path / "images")
     for path in folder.iterdir():
@@ -125,13 +127,22 @@ def test_what_is_calibrated_is_not_calibrated_again(shoot, tmp_path: Path, monke
     assert calls == []
     assert rig.read_bytes() == before
     assert (tmp_path / "model").is_dir()
-    save_rig(rig, replace(load_rig(rig), distortion=np.zeros((CAMERAS, 5))))
+    rig.unlink()
     assert run(*calibrate(images, rig)) == 0
     assert calls == [1]
     assert rig.read_bytes() == before
+    save_rig(rig, replace(load_rig(rig), distortion=np.zeros((CAMERAS, 5))))
+    changed = rig.read_bytes()
+    assert fails(capsys, *calibrate(images, rig)) == (
+        f"{rig}: expected no file yet, or this very result; found another; use --overwrite"
+    )
+    assert rig.read_bytes() == changed
+    assert run(*calibrate(images, rig, "--overwrite")) == 0
+    assert rig.read_bytes() == before
+    calls.clear()
     (images / "cam00" / "008.png").unlink()
-    assert run(*calibrate(images, rig)) == 0
-    assert calls == [1, 1]
+    assert run(*calibrate(images, rig)) == 0, "of other images a rig of ours is made anew without a question"
+    assert calls == [1]
     assert rig.read_bytes() != before
 
 
@@ -151,7 +162,47 @@ def test_a_rig_of_other_settings_is_not_replaced_unasked(shoot, tmp_path: Path, 
     assert run(*calibrate(folder / "images", rig, *other, "--overwrite")) == 0
     assert json.loads((tmp_path / "calibration.json").read_text())["config"]["hold_out"] == 0
     (tmp_path / "calibration_stage.json").unlink()
-    assert run(*calibrate(folder / "images", rig, *other)) == 0, "a rig without a record is replaced, as ever"
+    assert run(*calibrate(folder / "images", rig, *other)) == 0, "this very rig"
+
+
+def test_a_rig_from_elsewhere_is_not_replaced_before_any_work_is_done(
+    shoot, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    folder, _, _ = shoot
+    monkeypatch.setattr(calibration_stage, "detect_corners", None)
+    for name in ("rig.json", "calibration.json", "calibration.html"):
+        place = tmp_path / name
+        place.write_text("of the user")
+        said = fails(capsys, *calibrate(folder / "images", tmp_path / "rig.json"))
+        assert said == f"{place}: expected no file yet, or that of an earlier run; found another; use --overwrite"
+        assert place.read_text() == "of the user"
+        place.unlink()
+
+
+def test_a_photograph_is_never_written_over(shoot, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    images = shutil.copytree(shoot[0] / "images", tmp_path / "images")
+    photograph = images / "cam00" / "000.png"
+    (tmp_path / "rig.json").hardlink_to(photograph)
+    before = photograph.read_bytes()
+    said = fails(capsys, *calibrate(images, tmp_path / "rig.json", "--overwrite"))
+    assert said == f"{tmp_path / 'rig.json'}: expected a file to write to, found the input {photograph}"
+    assert photograph.read_bytes() == before
+
+
+def test_a_model_that_is_there_needs_a_word(shoot, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    folder, model = shoot[0], tmp_path / "model"
+    command = ("convert-rig", folder / "rig.json", "--output", model)
+    assert run(*command) == 0
+    assert run(*command) == 0, "the same once more"
+    before = {path.name: path.read_bytes() for path in model.iterdir()}
+    said = fails(capsys, *command, "--scale", "2")
+    assert said.startswith(f"{model}")
+    assert said.endswith("expected no file yet, or this very result; found another; use --overwrite")
+    assert {path.name: path.read_bytes() for path in model.iterdir()} == before
+    assert run(*command, "--scale", "2", "--overwrite") == 0
+    own = next(path for path in sorted(model.iterdir()) if path.name.startswith("cameras"))
+    said = fails(capsys, "convert-rig", model, "--output", own, "--overwrite")
+    assert said == f"{own}: expected a file to write to, found the input {own}"
 
 
 def test_an_image_that_cannot_be_read_does_not_cost_those_that_can(

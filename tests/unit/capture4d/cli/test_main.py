@@ -429,23 +429,29 @@ def test_register_mesh_keeps_the_templates_faces_and_measures(
 @pytest.mark.parametrize(
     ("limits", "code"),
     [
-        (["fit_mean_mm=1.0"], 0),
-        (["fit_mean_mm=0.5"], 3),
-        (["fit_mean_mm=1.0", "boundary_mean_mm=1.0"], 3),
-        (["lost=1e9"], 3),  # null: not measured
-        (["fit=1"], 1),
-        (["fit_mean_mm"], 1),
+        (["above fit_mean_mm=1.0"], 0),
+        (["above fit_mean_mm=0.5"], 3),
+        (["above fit_mean_mm=1.0", "above boundary_mean_mm=1.0"], 3),
+        (["above border_mean_mm=1e9"], 3),  # null: not measured
+        (["below covered_percent=90"], 0),
+        (["below covered_percent=99.5"], 3),
+        (["below border_mean_mm=0"], 3),
+        (["above fit_mean_mm=1.0", "below covered_percent=99.5"], 3),
+        (["above fit=1"], 1),
+        (["below joint_max_mm=1"], 1),  # there is such a metric, but not of this take
+        (["above fit_mean_mm"], 1),
+        (["below covered_percent=nan"], 1),
     ],
 )
 def test_the_report_gates(
     limits: list[str], code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    values = {"fit_mean_mm": 0.7, "boundary_mean_mm": 2.0, "lost": None}
+    values = {"fit_mean_mm": 0.7, "boundary_mean_mm": 2.0, "border_mean_mm": None, "covered_percent": 98.0}
     write_json(
         tmp_path / "report" / "metrics.json",
         {"metrics": [{"key": key, "value": value, "unit": "mm", "better": "lower"} for key, value in values.items()]},
     )
     monkeypatch.setattr(pipeline, "report", lambda work, **_: StageResult(work / "report" / "index.html", ""))
-    options = [word for limit in limits for word in ("--fail-above", limit)]
+    options = [word for limit in limits for word in f"--fail-{limit}".split()]
     assert run("report", tmp_path, *options) == code
     assert capsys.readouterr().err.count("\n") == bool(code)

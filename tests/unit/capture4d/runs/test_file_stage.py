@@ -54,6 +54,19 @@ def test_what_was_lost_or_touched_is_made_anew(files: list[Path]) -> None:
     assert opened(files[0].parent).made(files) is None
 
 
+def test_what_is_the_users_is_told_from_what_a_run_has_left(files: list[Path]) -> None:
+    folder = files[0].parent
+    assert opened(folder, images="other").may_replace(files)
+    assert not opened(folder).may_replace([*files, folder / "notes.txt"])
+    files[0].unlink()
+    assert opened(folder).may_replace(files), "what was lost is nobody's"
+    files[1].write_text("touched")
+    assert not opened(folder).may_replace(files)
+    files[1].unlink()
+    files[1].mkdir()
+    assert not opened(folder).may_replace(files)
+
+
 def test_other_inputs_are_taken_without_a_question(files: list[Path]) -> None:
     assert opened(files[0].parent, images="other").made(files) is None
 

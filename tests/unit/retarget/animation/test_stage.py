@@ -82,6 +82,14 @@ def test_another_person_gets_the_garment_outside_the_body(model: Path, works, tm
     assert run("report", output, "--workers", "1", "--fail-above", "inside_before_percent=0.3") == 3
 
 
+def test_a_motion_is_not_written_over_by_what_it_moves(model: Path, works, capsys) -> None:
+    poses = works[1] / "body" / "poses.npz"
+    before = poses.read_bytes()
+    said = fails(capsys, *animate(model, poses, works[1]), "--overwrite")
+    assert said == f"capture4d: {poses}: expected a file to write to, found the input {poses}"
+    assert poses.read_bytes() == before
+
+
 def test_an_interrupted_animation_is_finished_by_the_same_command(model: Path, works, tmp_path: Path) -> None:
     poses, output = works[1] / "body" / "poses.npz", tmp_path / "out"
     assert run(*animate(model, poses, output)) == 0

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from capture4d.app.drawing.render import Drawn, View, frame_view, heat_colours, render
+from capture4d.app.drawing.render import BEYOND, Drawn, View, frame_view, heat_colours, render
 from capture4d.types import Mesh
 
 RED, GREEN, BLUE = (220, 30, 30), (30, 200, 30), (30, 30, 220)
@@ -103,11 +103,13 @@ def test_nothing_to_draw_is_background():
     assert (render([Drawn(empty)], view, width=4, height=4, background=(10, 20, 30)) == (10, 20, 30)).all()
 
 
-def test_heat_colours_darken_with_the_value_and_mark_missing_data_grey():
+def test_heat_colours_darken_with_the_value_and_mark_what_is_beyond_and_what_is_missing():
     colours = heat_colours(np.array([0.0, 0.5, 1.0, 2.0, np.nan]), high=1.0).astype(int)
     luminance = colours @ [0.299, 0.587, 0.114]
     assert luminance[0] > luminance[1] > luminance[2]
-    np.testing.assert_array_equal(colours[2], colours[3])
+    np.testing.assert_array_equal(colours[3], BEYOND)
+    scale = heat_colours(np.linspace(0, 1, 256), high=1.0).astype(int)
+    assert np.abs(scale - BEYOND).sum(axis=1).min() > 150, "a clipped value is not taken for one on the scale"
     assert np.ptp(colours[4]) < 15
     steps = np.diff(heat_colours(np.linspace(0, 1, 256), high=1.0) @ [0.299, 0.587, 0.114])
     assert (steps <= 1).all()
