@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from capture4d.body.binding import with_body_shape
+from capture4d.body.sewing_pattern import with_known_pattern
 from capture4d.captures.capture import Capture
 from capture4d.captures.garment_scans import load_garment_scan
 from capture4d.captures.work_folder import (
@@ -85,7 +86,9 @@ def run(
         upstream["motion"] = capture.motion_digest
     stage = open_stage(output, name=REGISTER, schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite)
     moving = capture.posed_body if body_folder is None else load_tracking(body_folder)
-    garment = capture.template if moving is None else with_body_shape(capture.template, moving[0], moving[1].shape)
+    garment = with_known_pattern(capture.template)
+    if moving is not None:
+        garment = with_body_shape(garment, moving[0], moving[1].shape)
     if capture.boundary_colours and not garment.loops:
         raise InputError("expected a template with open borders, as its scans have; found none", where=capture.path)
     if not (output / "garment.npz").is_file():
