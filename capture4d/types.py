@@ -301,9 +301,13 @@ class Garment:
     """None for a garment (or any other template) without a body."""
     body_shape: Float32[np.ndarray, " shapes"] | None = None
     """Shape of the person in whose rest pose the template lies; None if nobody knows."""
+    pattern_metres: float | None = None
+    """Metres in a unit of the UVs if these are the sewing pattern; 0 if they are not; None if nobody has said."""
 
     def __post_init__(self) -> None:
         verts = len(self.template.vertices)
+        if self.pattern_metres is not None and not 0 <= self.pattern_metres < float("inf"):
+            raise InputError(f"Garment.pattern_metres: expected metres, or 0, found {self.pattern_metres}")
         for name, loop in self.loops.items():
             require_array("Garment", f"loops[{name!r}]", loop, (None,), np.int32)
             require_indices("Garment", f"loops[{name!r}]", loop, verts)

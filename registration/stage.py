@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from capture4d.body.binding import with_body_shape
+from capture4d.body.sewing_pattern import with_known_pattern
 from capture4d.captures.capture import Capture
 from capture4d.captures.garment_scans import load_garment_scan
 from capture4d.captures.work_folder import (
@@ -166,7 +167,9 @@ def _moving(capture: Capture, body_folder: Path | None) -> tuple[Body, PoseSeque
 
 def _shaped(capture: Capture, moving: tuple[Body, PoseSequence] | None) -> Garment:
     """The template on the person who moves it."""
-    garment = capture.template if moving is None else with_body_shape(capture.template, moving[0], moving[1].shape)
+    garment = with_known_pattern(capture.template)
+    if moving is not None:
+        garment = with_body_shape(garment, moving[0], moving[1].shape)
     if capture.boundary_colours and not garment.loops:
         raise InputError("expected a template with open borders, as its scans have; found none", where=capture.path)
     return garment

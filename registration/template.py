@@ -8,19 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int32
 
+from capture4d.body.sewing_pattern import with_known_pattern
 from capture4d.errors import InputError
 from capture4d.geometry.mesh import edge_uses, edges_of_faces, unique_edges
-from capture4d.types import Garment, Mesh
+from capture4d.types import Garment
 from registration.config import RegistrationConfig
 from registration.deformation_graph import DeformationGraph, build_graph
 from registration.fold_lengths import edge_faces
 from registration.solver import Rows
 
 __all__ = ["Border", "TemplateAnalysis", "UnknownBorderError", "analyse_template", "require_borders"]
-
-
-PATTERN_RATIO = (0.7, 1.4)
-"""Edge lengths on the UVs over those on the mesh between which UVs can be a sewing pattern in metres."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,7 +77,7 @@ def analyse_template(garment: Garment, config: RegistrationConfig) -> TemplateAn
     graph = build_graph(rest, faces, nodes=config.graph.nodes, nodes_per_vertex=config.graph.nodes_per_vertex)
     border = _border(garment)
     edges = unique_edges(faces)
-    lengths = rest_lengths(garment.template, edges)
+    lengths = rest_lengths(with_known_pattern(garment), edges)
     corners_per_vertex = np.bincount(faces.reshape(-1), minlength=len(rest))
     return TemplateAnalysis(
         garment=garment,
@@ -118,23 +115,23 @@ def require_borders(border: Border, painted: Iterable[str]) -> None:
         )
 
 
-def rest_lengths(template: Mesh, edges: Int32[np.ndarray, "edges 2"]) -> Float64[np.ndarray, " edges"]:
-    """Lengths that the cloth wants: on the sewing pattern where the UVs are one in metres, else on the template.
+def rest_lengths(garment: Garment, edges: Int32[np.ndarray, "edges 2"]) -> Float64[np.ndarray, " edges"]:
+    """Lengths that the cloth wants: on the sewing pattern where the UVs are one, else on the template.
 
-    A draped template is stretched here and folded there; the pattern is not. UVs count as a pattern in metres if most
-    of their lengths are near those of the mesh. On a seam both panels are averaged.
+    A draped template is stretched here and folded there; the pattern is not. Charts that were cut out of the template
+    know no more than it does, and a few per cent less: such lengths push the cloth about by millimetres
+    (`python -m benchmarks own_template`). On a seam both panels are averaged.
+
+    Args:
+        garment: one that says whether its UVs are its pattern.
     """
-    vertices, faces = template.vertices.astype(np.float64), template.faces
-    on_mesh = np.linalg.norm(vertices[edges[:, 1]] - vertices[edges[:, 0]], axis=1)
-    if template.uv is None:
-        return on_mesh
-    uv = template.uv.astype(np.float64)
-    lengths = np.linalg.norm(uv - uv[:, [1, 2, 0]], axis=2).reshape(-1)
+    vertices, faces, uv = garment.template.vertices.astype(np.float64), garment.template.faces, garment.template.uv
+    if uv is None or not garment.pattern_metres:
+        return np.linalg.norm(vertices[edges[:, 1]] - vertices[edges[:, 0]], axis=1)
+    sides = uv.astype(np.float64)
+    lengths = garment.pattern_metres * np.linalg.norm(sides - sides[:, [1, 2, 0]], axis=2).reshape(-1)
     edge_of = edges_of_faces(faces, edges).reshape(-1)
-    on_pattern = np.bincount(edge_of, lengths) / np.bincount(edge_of)
-    ratio = on_pattern / np.maximum(on_mesh, 1e-12)
-    alike = (ratio > PATTERN_RATIO[0]) & (ratio < PATTERN_RATIO[1])
-    return on_pattern if alike.mean() > 0.95 else on_mesh
+    return np.bincount(edge_of, lengths) / np.bincount(edge_of)
 
 
 def _border(garment: Garment) -> Border:

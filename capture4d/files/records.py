@@ -79,6 +79,7 @@ def save_garment(path: str | Path, garment: Garment) -> None:
         "embedding_barycentric": garment.embedding_barycentric,
         "skin_weights": garment.skin_weights,
         "body_shape": garment.body_shape,
+        "pattern_metres": None if garment.pattern_metres is None else np.float64(garment.pattern_metres),
     }
     write_npz(
         path,
@@ -98,6 +99,7 @@ def load_garment(path: str | Path, data: bytes | None = None) -> Garment:
             embedding_barycentric=arrays.get("embedding_barycentric"),
             skin_weights=arrays.get("skin_weights"),
             body_shape=arrays.get("body_shape"),
+            pattern_metres=arrays.number("pattern_metres") if "pattern_metres" in arrays else None,
         )
         return on_open_edges(garment)
 

@@ -7,10 +7,12 @@ from typing import Literal
 from capture4d.settings import Whole, settings
 from capture4d.units import Units
 
-__all__ = ["TEMPLATE", "Region", "TemplateConfig", "UvChoice"]
+__all__ = ["TEMPLATE", "Axis", "MeshUnits", "Region", "TemplateConfig", "UvChoice"]
 
 Region = Literal["tshirt", "longsleeve", "trousers", "shorts"]
 UvChoice = Literal["auto", "keep", "fresh", "none"]
+Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
+MeshUnits = Literal["auto", Units]
 
 
 @settings
@@ -25,8 +27,12 @@ class TemplateConfig:
     """Keep the mesh's UVs or cut fresh ones; `auto` keeps them if nothing is wrong with them."""
     loop_names: tuple[str, ...] = ()
     """Names of the border loops, the one with the most vertices first; found by their place if empty."""
-    mesh_units: Units = "m"
-    """Of the mesh."""
+    mesh_units: MeshUnits = "auto"
+    """Of the mesh; `auto` takes the unit in which it lies on the body."""
+    up: Axis | None = None
+    """Axis of the mesh that points up; found by how it lies on the body if None."""
+    uv_is_pattern: bool = False
+    """The mesh's UVs are its sewing pattern, whatever they look like."""
 
 
 TEMPLATE = TemplateConfig()

@@ -16,6 +16,7 @@ from jaxtyping import Float32, Float64, Int32
 
 from capture4d.body.binding import WEIGHT_SMOOTHING, diffuse
 from capture4d.body.posed_surface import PosedSurface, match, tracked_body
+from capture4d.body.sewing_pattern import PatternFit, as_pattern, fit_pattern
 from capture4d.body.skinning import PosedBody, unskin
 from capture4d.captures.names import require_plain_names
 from capture4d.errors import InputError
@@ -49,10 +50,18 @@ class TemplateReport:
     uv: UvReport
     """Of the mesh as it came."""
     fresh_uv: bool
+    pattern: PatternFit | None = None
+    """How the UVs that were kept compare with a sewing pattern; None where none were kept."""
 
 
 def make_template(
-    mesh: Mesh, body: PosedBody, *, uv: UvChoice = "auto", names: Sequence[str] = (), source: str = "mesh"
+    mesh: Mesh,
+    body: PosedBody,
+    *,
+    uv: UvChoice = "auto",
+    uv_is_pattern: bool = False,
+    names: Sequence[str] = (),
+    source: str = "mesh",
 ) -> tuple[Garment, TemplateReport]:
     """Bind a mesh to the body it lies on, and take it to the rest pose.
 
@@ -60,6 +69,7 @@ def make_template(
         mesh: metres, in the world of the posed body. Where it is split at seams, the template is joined; UVs, which
             belong to face corners, stay.
         uv: keep the mesh's, cut `fresh` ones, have `none`; `auto` keeps them if nothing is wrong with them.
+        uv_is_pattern: the UVs are the sewing pattern, whatever they look like; else they are compared with one.
         names: of the loops, the one with the most vertices first; found by position if empty.
         source: what errors call the mesh.
     Raises:
@@ -85,7 +95,11 @@ def make_template(
         )
     loops = boundary_loops(mesh.faces)
     found = check_uv(mesh)
-    kept, fresh = _choose_uv(mesh, found, uv, source)
+    if uv_is_pattern and uv in ("fresh", "none"):
+        raise InputError(f"expected UVs that are kept, being the pattern; found --uv {uv}", where=source)
+    kept, fresh = (mesh.uv, False) if uv_is_pattern else _choose_uv(mesh, found, uv, source)
+    own = fresh or (kept is None and not uv_is_pattern)
+    metres, pattern = _pattern(mesh, source, own=own, told=uv_is_pattern)
     garment = Garment(
         template=Mesh(rest.astype(np.float32), mesh.faces, kept),
         loops=dict(zip(_loop_names(loops, names, weights, rest, body.shaped.body, source), loops, strict=True)),
@@ -93,8 +107,9 @@ def make_template(
         embedding_barycentric=barycentric,
         skin_weights=weights,
         body_shape=np.asarray(body.shaped.shape, np.float32),
+        pattern_metres=metres,
     )
-    return garment, TemplateReport(len(mesh.vertices), len(mesh.faces), distance, found, fresh)
+    return garment, TemplateReport(len(mesh.vertices), len(mesh.faces), distance, found, fresh, pattern)
 
 
 def _bind(mesh: Mesh, body: PosedBody) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -151,6 +166,24 @@ def _choose_uv(mesh: Mesh, found: UvReport, choice: UvChoice, source: str) -> tu
     if choice == "fresh" or faults:
         return fresh_uv(mesh), True
     return mesh.uv, False
+
+
+def _pattern(mesh: Mesh, source: str, *, own: bool, told: bool) -> tuple[float, PatternFit | None]:
+    """Metres in a unit of the UVs, 0 where they are no sewing pattern, and how they compare with one.
+
+    Args:
+        own: the UVs are ours, or there are none; what was cut out of the mesh knows no more of lengths than the mesh.
+        told: somebody says that they are the pattern.
+    """
+    if own:
+        return 0.0, None
+    if told:
+        try:
+            return as_pattern(mesh), None
+        except InputError as error:
+            raise error.at(source) from None
+    fit = fit_pattern(mesh)
+    return (0.0 if fit is None or fit.faults() else fit.metres), fit
 
 
 def _loop_names(

@@ -9,6 +9,7 @@ import numpy as np
 
 from capture4d.body.anny import load_anny
 from capture4d.body.skinning import PosedBody, pose_frame, with_pose, with_shape
+from capture4d.captures.placement import place
 from capture4d.errors import InputError
 from capture4d.files.atomic import file_digest
 from capture4d.files.records import load_body, save_garment
@@ -18,8 +19,8 @@ from capture4d.runs.stage import StageResult
 from capture4d.templates.body_regions import body_region
 from capture4d.templates.config import TEMPLATE, TemplateConfig
 from capture4d.templates.garment import TemplateReport, make_template
+from capture4d.templates.placing import Placed, find_placement
 from capture4d.types import Body, Garment
-from capture4d.units import METRES
 
 __all__ = ["TemplateResult", "run"]
 
@@ -32,6 +33,8 @@ class TemplateResult(StageResult):
     report: TemplateReport
     notes: tuple[str, ...] = ()
     """What in the mesh's file could not be used."""
+    placed: Placed | None = None
+    """In what unit the mesh is, and with which axes; None of a region of the body."""
 
 
 def run(
@@ -59,6 +62,7 @@ def run(
         raise InputError(f"template: expected a mesh or --region, found {'neither' if mesh is None else 'both'}")
     wearer = load_body(body) if body else load_anny()
     posed = _posed(wearer, poses, config.pose_frame)
+    placed = None
     if mesh is None:
         assert config.region is not None
         posed = _at_rest(wearer, posed.shaped.shape)
@@ -66,11 +70,19 @@ def run(
     else:
         found = read_mesh(mesh)
         surface, source, notes = found.mesh, str(mesh), found.notes
-        surface = surface.with_vertices(surface.vertices * np.float32(METRES[config.mesh_units]))
-    garment, report = make_template(surface, posed, uv=config.uv, names=config.loop_names, source=source)
+        placed = find_placement(surface, posed, units=config.mesh_units, up=config.up)
+        surface = place(surface, placed.placement)
+    garment, report = make_template(
+        surface,
+        posed,
+        uv=config.uv,
+        uv_is_pattern=config.uv_is_pattern,
+        names=config.loop_names,
+        source=source,
+    )
     save_garment(output, garment)
     return TemplateResult(
-        output, file_digest([output], root=output.parent), garment=garment, report=report, notes=notes
+        output, file_digest([output], root=output.parent), garment=garment, report=report, notes=notes, placed=placed
     )
 
 

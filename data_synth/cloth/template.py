@@ -38,4 +38,5 @@ def bind_template(
         embedding_barycentric=barycentric,
         skin_weights=weights.astype(np.float32),
         body_shape=settled_body.shaped.shape.astype(np.float32),
+        pattern_metres=1.0,
     )

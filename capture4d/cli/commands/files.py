@@ -12,12 +12,10 @@ from tyro.conf import Positional, arg
 from capture4d.cli.exit_codes import BAD_RESULT, GOOD
 from capture4d.cli.options import MeshOptions
 from capture4d.settings import Positive, Whole
-from capture4d.templates.config import Region, TemplateConfig, UvChoice
+from capture4d.templates.config import Axis, MeshUnits, Region, TemplateConfig, UvChoice
 from registration.config import MeshRegistrationConfig
 
 __all__ = ["ConvertBody", "ConvertPoses", "ConvertRig", "RegisterMesh", "Template"]
-
-Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,26 +47,34 @@ class Template(FileOptions, MeshOptions):
     """Keep the mesh's UVs or cut fresh ones; `auto` keeps them if nothing is wrong with them."""
     names: tuple[str, ...] = ()
     """Names of the border loops, the one with the most vertices first; found by their place if absent."""
-    units: Literal["m", "cm", "mm", "in"] = "m"
-    """Of the mesh."""
+    uv_is_pattern: bool = False
+    """The mesh's UVs are its sewing pattern: registration takes the cloth's lengths from them. Without this they are
+    compared with one, and the command says what it found."""
+    units: MeshUnits = "auto"
+    """Of the mesh; `auto` takes the unit in which it lies on the body, and says it."""
+    up: Axis | None = None
+    """Axis of the mesh that points up; found by how it lies on the body, and said, if absent."""
 
     def __call__(self) -> int:
         from capture4d import pipeline
+        from capture4d.templates.told import told
 
-        config = TemplateConfig(self.frame, self.region, self.uv, self.names, self.units)
+        config = TemplateConfig(
+            self.frame,
+            self.region,
+            self.uv,
+            self.names,
+            self.units,
+            self.up,
+            self.uv_is_pattern,
+        )
         result = pipeline.template(
             self.mesh, self.output, config, body=self.body, poses=self.poses, overwrite=self.overwrite
         )
-        garment, report = result.garment, result.report
         for note in result.notes:
             print(f"capture4d: {self.mesh}: {note}", file=sys.stderr)
-        loops = ", ".join(f"{name} ({len(loop)})" for name, loop in garment.loops.items())
-        faults = ", ".join(report.uv.faults())
-        cut = f"cut afresh{f' ({faults})' if faults else ''}"
-        uvs = "none" if garment.template.uv is None else cut if report.fresh_uv else "kept"
-        print(f"{report.vertices} vertices, {report.faces} faces, {1e3 * report.distance_m:.1f} mm from the body")
-        print(f"borders: {loops}")
-        print(f"UVs: {uvs}")
+        for line in told(result):
+            print(line)
         print(f"template: {result.path}")
         return GOOD
 

@@ -1,5 +1,7 @@
 """Rest lengths and difference operators of a template."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from capture4d.geometry.mesh import unique_edges
@@ -7,7 +9,7 @@ from capture4d.types import Mesh
 from registration.template import analyse_template, rest_lengths
 
 
-def test_lengths_come_from_a_pattern_in_metres_and_else_from_the_mesh(garment) -> None:
+def test_lengths_come_from_a_pattern_and_else_from_the_mesh(garment) -> None:
     mesh = garment.template
     edges = unique_edges(mesh.faces)
     on_mesh = np.linalg.norm(mesh.vertices[edges[:, 0]] - mesh.vertices[edges[:, 1]], axis=1)
@@ -18,10 +20,24 @@ def test_lengths_come_from_a_pattern_in_metres_and_else_from_the_mesh(garment) -
         second = corners[2] - corners[0]
         flat[face, 1] = length, 0
         flat[face, 2] = second @ along / length, np.linalg.norm(np.cross(along, second)) / length
-    pattern = Mesh(mesh.vertices, mesh.faces, 1.1 * flat)
-    np.testing.assert_allclose(rest_lengths(pattern, edges), 1.1 * on_mesh, rtol=1e-5)
-    unit_square = Mesh(mesh.vertices, mesh.faces, 20 * flat)
-    np.testing.assert_allclose(rest_lengths(unit_square, edges), on_mesh, rtol=1e-5)
+    for metres, expected in ((1.1, 1.1), (0.0, 1.0), (None, 1.0)):
+        told = replace(garment, template=Mesh(mesh.vertices, mesh.faces, flat), pattern_metres=metres)
+        np.testing.assert_allclose(rest_lengths(told, edges), expected * on_mesh, rtol=1e-5)
+    np.testing.assert_allclose(rest_lengths(replace(garment, pattern_metres=1.0), edges), on_mesh, rtol=1e-5)
+
+
+def test_an_atlas_of_the_template_changes_nothing(garment, config) -> None:
+    """Charts that were cut out of the mesh know no more than the mesh: its lengths stay as without any UVs."""
+    mesh = garment.template
+    without = analyse_template(garment, config)
+    with_atlas = analyse_template(replace(garment, template=replace(mesh, uv=_one_by_one(mesh))), config)
+    np.testing.assert_array_equal(with_atlas.rest_lengths, without.rest_lengths)
+
+
+def _one_by_one(mesh: Mesh) -> np.ndarray:
+    """Every triangle squeezed by a tenth, beside the one before."""
+    corners = mesh.vertices[mesh.faces]
+    return (corners[..., :2] * (0.9, 1.0) + np.arange(len(corners))[:, None, None]).astype(np.float32)
 
 
 def test_laplacian_vanishes_on_constants_and_follows_the_border(garment, config) -> None:
