@@ -144,7 +144,7 @@ class ConvertPoses:
     format: Literal["poses", "amass"] = "poses"
     """What kind of .npz to write."""
     fps: Positive | None = None
-    """Frame rate of the result; that of the input if absent. Of an input that tells no rate, its own."""
+    """Frame rate that the motion is resampled to; that of the input if absent. Of an input that tells no rate, its own."""
     names: str = "auto"
     """Whose names a BVH's joints have: `auto` finds out; mixamo, cmu, lafan, rokoko, xsens, smpl, biped, unreal, unity,
     motive, neuron, blender, daz, vicon, mocopi, makehuman; or a JSON file, our joint: their joint."""
@@ -157,11 +157,11 @@ class ConvertPoses:
         from capture4d.body.anny import load_anny
         from capture4d.files.records import load_body
         from capture4d.motions.clips import MotionWords
-        from capture4d.motions.motion_files import read_motion, write_motion
+        from capture4d.motions.motion_files import read_motion, told, write_motion
 
         body = load_body(self.body) if self.body else load_anny()
         words = MotionWords.of(self.names, self.up, self.facing)
-        poses = read_motion(self.input, body, fps=self.fps, words=words, say=lambda note: print(f"read: {note}"))
+        poses = read_motion(self.input, body, fps=self.fps, words=words, say=told(self.input))
         write_motion(self.output, body, poses, amass=self.format == "amass")
         print(f"{len(poses.frame_ids)} poses at {poses.fps:g} fps: {self.output}")
         return GOOD
