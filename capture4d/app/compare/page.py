@@ -24,7 +24,7 @@ import torch
 
 from capture4d.app.compare.config import CompareConfig
 from capture4d.app.compare.inputs import open_inputs
-from capture4d.app.compare.measures import Row, measure, true_vertices
+from capture4d.app.compare.measures import Row, conclusion, measure, true_vertices
 from capture4d.app.compare.methods import methods
 from capture4d.app.compare.pictures import ERROR_DEG, Pictures, draw
 from capture4d.app.drawing.panels import Panel, colour_bar, write_panel
@@ -101,6 +101,7 @@ def _write_table(
             "frames": frame_ids,
             "against_truth": against_truth,
             "methods": [asdict(row) for row in table],
+            "conclusion": conclusion(table, against_truth=against_truth),
             "pictures": kept,
             "people": people,
         },
@@ -137,5 +138,6 @@ def _write_page(
     page = environment.get_template("compare.html.jinja").render(
         name=name, rows=table, frames=pictures.frames, count=count, against_truth=against_truth, error_deg=ERROR_DEG,
         bar=colour_bar(ERROR_DEG), people=pictures.people, middle=pictures.people_frame, left_out=left_out,
+        conclusion=conclusion(table, against_truth=against_truth),
     )  # fmt: skip
     write_bytes(path, page.encode())
