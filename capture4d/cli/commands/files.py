@@ -144,7 +144,7 @@ class ConvertPoses:
     format: Literal["poses", "amass"] = "poses"
     """What kind of .npz to write."""
     fps: Positive | None = None
-    """Frame rate that the motion is resampled to; that of the input if absent. Of an input that tells no rate, its own."""
+    """Frame rate to resample to; that of the input if absent. Of an input that tells no rate, its own."""
     names: str = "auto"
     """Whose names a BVH's joints have: `auto` finds out; mixamo, cmu, lafan, rokoko, xsens, smpl, biped, unreal, unity,
     motive, neuron, blender, daz, vicon, mocopi, makehuman; or a JSON file, our joint: their joint."""
