@@ -89,7 +89,7 @@ def read_motion(
     for note in notes:
         say(note)
     if not same_rate(resampled.fps, poses.fps):
-        say(rate_note(poses, resampled))
+        say(rate_note(poses.fps, len(poses.frame_ids), resampled.fps, len(resampled.frame_ids)))
     return resampled
 
 
@@ -114,15 +114,14 @@ def same_rate(one: float, other: float) -> bool:
     return abs(one - other) <= RATE_TOLERANCE * other
 
 
-def rate_note(poses: PoseSequence, resampled: PoseSequence, *, whose: str = "") -> str:
+def rate_note(fps: float, frames: int, new_fps: float, new_frames: int, *, whose: str = "") -> str:
     """What is told of a motion that was resampled.
 
     Args:
         whose: rate the new one is, such as "the model's".
     """
-    to = " ".join(filter(None, (whose, f"{resampled.fps:g}")))
-    before, after = len(poses.frame_ids), len(resampled.frame_ids)
-    return f"{poses.fps:g} frames a second, resampled to {to}: {before} frames became {after}"
+    to = " ".join(filter(None, (whose, f"{new_fps:g}")))
+    return f"{fps:g} frames a second, resampled to {to}: {frames} frames became {new_frames}"
 
 
 def resample(poses: PoseSequence, fps: float) -> PoseSequence:

@@ -194,7 +194,7 @@ def _motion(
     if shown is not found:
         whose = "" if fps else "the model's"
         between = "" if same_rate(shown.fps, asked.fps) else f"; the garment answers at the model's {asked.fps:g}"
-        say(rate_note(found, shown, whose=whose) + between)
+        say(rate_note(found.fps, len(found.frame_ids), shown.fps, len(shown.frame_ids), whose=whose) + between)
     elif asked is not found:
         say(f"{found.fps:g} frames a second, as wanted; the garment answers at the model's {asked.fps:g}")
     return asked, shown

@@ -138,7 +138,7 @@ class _Frame:
         return data_uri(render([Drawn(mesh, normal_map=normal_map)], view, width=WIDTH, height=HEIGHT))
 
     def _tangent_image(self, normals: np.ndarray, vertices: np.ndarray) -> np.ndarray:
-        return self.template.tangent_image(normals, self.template.frames(vertices)).astype(np.float32)
+        return self.template.tangent_image(normals, vertices)
 
 
 def _strip(template: MapTemplate, methods: Sequence[Method], held: PairTake, at: int) -> list[Panel]:
