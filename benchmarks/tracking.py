@@ -47,6 +47,7 @@ from capture4d.motions.bvh import read_bvh
 from capture4d.motions.clips import understood
 from capture4d.motions.motion_files import read_motion, write_motion
 from capture4d.motions.retargeting import retarget
+from capture4d.motions.sources import acknowledgement
 from capture4d.tracking.config import TrackingConfig
 from capture4d.tracking.sequence import Followed, Tracker
 from capture4d.tracking.stage import run as track
@@ -102,6 +103,8 @@ def run(
         Metric("flagged_percent", 100 * float(np.mean([take.flagged for take in takes])), "%"),
         Metric("frames", float(sum(len(take.cpu_s) for take in takes)), "", "higher"),
     ]
+    if mocap.is_file():
+        console.print(acknowledgement(mocap) or "", soft_wrap=True)
     console.print("\n".join(f"{metric.key} {metric.value:.3f}" for metric in metrics))
     metrics += _cold_starts(tracker, cold_starts, np.random.default_rng([seed, 10]), console)
     with tempfile.TemporaryDirectory(prefix="capture4d-tracking-") as scratch:

@@ -19,7 +19,7 @@ from capture4d.body.skinning import ShapedBody, with_pose
 from capture4d.errors import InputError
 from capture4d.motions.bvh import read_bvh
 from capture4d.motions.clips import understood
-from capture4d.motions.motion_files import told
+from capture4d.motions.motion_files import rate_note, same_rate, told
 from capture4d.motions.retargeting import pose_sequence, retarget
 from capture4d.types import PoseSequence
 from data_synth.config import ClipName, MotionConfig
@@ -124,14 +124,14 @@ def make_motion(
     wanted = config.skip_frames + frames
     if config.bvh is not None:
         clip, notes = understood(read_bvh(Path(config.bvh)))
+        poses = retarget(shaped, clip, fps, first_frame=config.skip_frames)
+        found, own_fps = config.skip_frames + len(poses.frame_ids), round(1 / clip.frame_time_s, 3)
+        if len(poses.frame_ids) < frames:
+            raise InputError(f"expected at least {wanted} frames at {fps:g} fps, found {found}", where=config.bvh)
+        if not same_rate(own_fps, fps):
+            notes = [*notes, rate_note(own_fps, len(clip.pelvis), fps, found, whose="the capture's")]
         for note in notes:
             told(Path(config.bvh))(note)
-        poses = retarget(shaped, clip, fps, first_frame=config.skip_frames)
-        if len(poses.frame_ids) < frames:
-            raise InputError(
-                f"expected at least {wanted} frames at {fps:g} fps, found {config.skip_frames + len(poses.frame_ids)}",
-                where=config.bvh,
-            )
         return _cut(poses, 0, frames, reverse=config.reverse)
     if config.clip == "sampled":
         poses = sample_poses(shaped, fps, wanted, rng)

@@ -236,4 +236,7 @@ class AnimateConfig:
     stretched in what was learned from, if that is more; 0: they stay as long as they come."""
     unlike_deg: NonNegative = 10.0
     """A pose farther than this from every training pose is reported, unless the model was validated farther away."""
+    fps: Positive | None = None
+    """Frame rate of what is written; the model's if absent. Regressors always answer at the model's, whatever the
+    motion's; their coefficients are interpolated."""
     removal: RemovalConfig = field(default_factory=RemovalConfig)

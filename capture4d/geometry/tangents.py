@@ -14,9 +14,8 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, Int32
 
 from capture4d.geometry.mesh import connected_components, normalised, vertex_normals
-from capture4d.geometry.uv_raster import UvRaster
 
-__all__ = ["TangentLayout", "corner_tangents", "interpolated_frames", "tangent_frames", "uv_corners"]
+__all__ = ["TangentLayout", "corner_tangents", "frames_at", "interpolated_frames", "uv_corners"]
 
 
 def uv_corners(faces: Int32[np.ndarray, "F 3"], uv: Float[np.ndarray, "F 3 2"]) -> Int32[np.ndarray, "F 3"]:
@@ -91,16 +90,24 @@ def corner_tangents(
     return np.concatenate([tangent, sign], axis=-1).astype(np.float32)
 
 
-def tangent_frames(
-    raster: UvRaster, layout: TangentLayout, vertices: Float[np.ndarray, "V 3"]
+def frames_at(
+    layout: TangentLayout,
+    faces: Int32[np.ndarray, " N"],
+    barycentric: Float[np.ndarray, "N 3"],
+    *,
+    normals: Float[np.ndarray, "V 3"],
+    tangents: Float[np.ndarray, "F 3 3"],
 ) -> Float64[np.ndarray, "N 3 3"]:
-    """Orthonormal rows tangent, bitangent, normal at every texel."""
-    normals = vertex_normals(np.asarray(vertices, np.float64), layout.faces)
-    tangents = layout.tangents(vertices, normals)
+    """Orthonormal rows tangent, bitangent, normal at points of the surface.
+
+    Args:
+        normals: of the vertices.
+        tangents: of the face corners, as `layout` has them.
+    """
     return interpolated_frames(
-        np.einsum("nk,nkc->nc", raster.barycentric, normals[raster.corners]),
-        np.einsum("nk,nkc->nc", raster.barycentric, tangents[raster.faces]),
-        layout.sign[raster.faces],
+        np.einsum("nk,nkc->nc", barycentric, normals[layout.faces[faces]]),
+        np.einsum("nk,nkc->nc", barycentric, tangents[faces]),
+        layout.sign[faces],
     )
 
 

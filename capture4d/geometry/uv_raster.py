@@ -47,6 +47,13 @@ class UvRaster:
         """Values of face corners interpolated linearly."""
         return np.einsum("nk,nkc->nc", self.barycentric, values[self.faces])
 
+    def part(self, texels: slice) -> UvRaster:
+        """Some of the texels: what they show costs as much less."""
+        return UvRaster(
+            self.size, self.texels[texels], self.faces[texels], self.corners[texels], self.barycentric[texels],
+            self.inside[texels], self.covered[texels],
+        )  # fmt: skip
+
     def image(self, values: np.ndarray, *, background: float | bool = 0) -> np.ndarray:
         """The map (size, size, ...) of texel values (N, ...)."""
         flat = np.full((self.size * self.size, *values.shape[1:]), background, values.dtype)

@@ -36,10 +36,21 @@ from capture4d.motions.smpl_motions import AMASS_AXES, on_body, smpl_up, to_smpl
 from capture4d.motions.smpl_parameters import RATES, are_smpl_parameters, read_smpl_parameters
 from capture4d.types import Body, PoseSequence
 
-__all__ = ["read_motion", "resample", "told", "write_amass", "write_bvh", "write_motion"]
+__all__ = [
+    "rate_note",
+    "read_motion",
+    "resample",
+    "same_rate",
+    "told",
+    "write_amass",
+    "write_bvh",
+    "write_motion",
+]
 
 BVH_METRE = 100.0
 """Units of a written BVH in a metre."""
+RATE_TOLERANCE = 1e-3
+"""Relative difference of two frame rates that are the same."""
 AMASS_JOINTS = 52
 """SMPL-H: 22 of the body, 15 for each hand."""
 
@@ -55,9 +66,10 @@ def read_motion(
     """Poses of a body from a motion file, where they are in its world.
 
     Args:
-        fps: resample to this rate; None keeps the file's. Of a file that tells no rate, this is its own.
+        fps: resample to this rate, frames counted from 0 on; None keeps the file's rate and numbers. Of a file that
+            tells no rate, this is its own.
         words: what the user says of the file's joints and axes; what is not said is found.
-        say: is given what was found, a line at a time.
+        say: is given what was found, and whether the motion was resampled, a line at a time.
     Raises:
         InputError: an unknown kind of file, a damaged one, or joints that have no counterpart in the body.
     """
@@ -73,10 +85,12 @@ def read_motion(
                 poses, notes = _from_npz(path, body, words, fps)
             case other:
                 raise InputError(f"expected a motion file .npz or .bvh, found '{other}'")
-        poses = poses if fps is None else resample(poses, fps)
+        resampled = poses if fps is None else resample(poses, fps)
     for note in notes:
         say(note)
-    return poses
+    if not same_rate(resampled.fps, poses.fps):
+        say(rate_note(poses.fps, len(poses.frame_ids), resampled.fps, len(resampled.frame_ids)))
+    return resampled
 
 
 def told(path: Path) -> Callable[[str], None]:
@@ -93,6 +107,21 @@ def write_motion(path: Path, body: Body, poses: PoseSequence, *, amass: bool = F
             write_amass(path, body, poses) if amass else save_poses(path, poses)
         case other:
             raise InputError(f"expected a motion file .npz or .bvh, found '{other}'", where=path)
+
+
+def same_rate(one: float, other: float) -> bool:
+    """Whether two frame rates are one: files round theirs."""
+    return abs(one - other) <= RATE_TOLERANCE * other
+
+
+def rate_note(fps: float, frames: int, new_fps: float, new_frames: int, *, whose: str = "") -> str:
+    """What is told of a motion that was resampled.
+
+    Args:
+        whose: rate the new one is, such as "the model's".
+    """
+    to = " ".join(filter(None, (whose, f"{new_fps:g}")))
+    return f"{fps:g} frames a second, resampled to {to}: {frames} frames became {new_frames}"
 
 
 def resample(poses: PoseSequence, fps: float) -> PoseSequence:

@@ -2,7 +2,7 @@
 
 The output is a registered sequence like any other, without scan data: its residuals are NaN.
 
-body/          body.npz, poses.npz: who moves, and how, at the model's frame rate
+body/          body.npz, poses.npz: who moves, and how, at the rate of what is written
 registration/  stage.json, garment.npz, frames/000123.npz, metrics/000123.json, vertices.npy, metrics.jsonl
 """
 
@@ -25,12 +25,13 @@ from capture4d.files.arrays import map_array
 from capture4d.files.atomic import file_digest, read_json, write_json, write_json_lines, write_npy, write_npz
 from capture4d.files.outputs import require_apart
 from capture4d.files.records import load_body, load_poses, save_body, save_garment, save_poses
-from capture4d.motions.motion_files import read_motion, resample, told
+from capture4d.motions.motion_files import rate_note, read_motion, resample, same_rate, told
 from capture4d.runs.stage import Stage, StageResult, open_stage
 from capture4d.runs.workers import run_jobs
 from capture4d.types import PoseSequence
 from retarget.animation.animator import FRAMES_AT_ONCE, AnimatedFrame, Animator
 from retarget.animation.bodies import captured_person, person_of_shape, require_motion, retargeted_mean
+from retarget.animation.frame_rates import coefficients_at, seconds
 from retarget.animation.garment_model import GarmentModel, load_garment_model
 from retarget.config import AnimateConfig
 from retarget.model_folder import regressor_files
@@ -72,7 +73,7 @@ def run(
 
     Args:
         model: what `fit` wrote.
-        poses: a motion file; resampled to the model's frame rate.
+        poses: a motion file; resampled to the model's frame rate, or written at `config.fps`.
         output: work folder; gets body/ and registration/.
         device: of the LSTM.
     Raises:
@@ -105,8 +106,8 @@ def run_on_coefficients(
     workers: int = 1,
     overwrite: bool = False,
 ) -> StageResult:
-    """`run` with coefficients of the motion's frames instead of a regressor's: a take's own projections, or edited
-    ones."""
+    """`run` with coefficients of the motion's frames, at the model's rate, instead of a regressor's: a take's own
+    projections, or edited ones."""
     require_apart(_motion_files(output), [poses, wearer.body])
     known = load_garment_model(model, with_lstm=False)
     scene = _scene(known, poses, wearer, config)
@@ -131,7 +132,9 @@ class _Scene:
     known: GarmentModel
     person: ShapedBody
     motion: PoseSequence
-    """At the model's rate, with the shape of the person."""
+    """At the model's rate, with the shape of the person: what regressors are asked."""
+    shown: PoseSequence
+    """The same at the rate of what is written."""
     mean: Float64[np.ndarray, "verts 3"]
     """The garment's, in the person's rest pose."""
     sources: Mapping[str, Path]
@@ -140,12 +143,12 @@ class _Scene:
 
 def _scene(known: GarmentModel, poses: Path, wearer: Wearer, config: AnimateConfig) -> _Scene:
     person = _person(known, wearer)
-    motion = _motion(known, poses, person)
+    motion, shown = _motion(known, poses, person, config.fps)
     mean = retargeted_mean(known.model, captured_person(known.model, known.body), person, formula=config.mean)
     digests = {"model": known.digest, "poses": file_digest([poses], root=poses.parent)}
     if wearer.body is not None:
         digests["body"] = file_digest([wearer.body], root=wearer.body.parent)
-    return _Scene(known, person, motion, mean, {"model": known.folder, "poses": poses}, digests)
+    return _Scene(known, person, motion, shown, mean, {"model": known.folder, "poses": poses}, digests)
 
 
 def _model(path: Path, config: AnimateConfig, device: str) -> tuple[GarmentModel, str]:
@@ -179,16 +182,30 @@ def _own_shape(body: Path) -> np.ndarray:
     return load_poses(poses).shape if poses.is_file() else np.zeros(0, np.float32)
 
 
-def _motion(known: GarmentModel, path: Path, person: ShapedBody) -> PoseSequence:
-    """The motion at the model's rate, on the person."""
-    poses = read_motion(path, person.body, say=told(path))
+def _motion(
+    known: GarmentModel, path: Path, person: ShapedBody, fps: float | None
+) -> tuple[PoseSequence, PoseSequence]:
+    """The motion on the person, at the model's rate and at the wanted one; both from the file's own frames."""
+    say = told(path)
+    found = read_motion(path, person.body, say=say)
     try:
-        require_motion(known.model, poses)
+        require_motion(known.model, found)
+        found = replace(found, shape=np.asarray(person.shape, np.float32))
+        asked = _at_rate(found, known.model.fps)
+        shown = asked if fps is None or same_rate(fps, asked.fps) else _at_rate(found, fps)
     except InputError as error:
         raise error.at(path) from None
-    if abs(poses.fps - known.model.fps) > 1e-3 * known.model.fps:
-        poses = resample(poses, known.model.fps)
-    return replace(poses, shape=np.asarray(person.shape, np.float32))
+    if shown is not found:
+        whose = "" if fps else "the model's"
+        between = "" if same_rate(shown.fps, asked.fps) else f"; the garment answers at the model's {asked.fps:g}"
+        say(rate_note(found.fps, len(found.frame_ids), shown.fps, len(shown.frame_ids), whose=whose) + between)
+    elif asked is not found:
+        say(f"{found.fps:g} frames a second, as wanted; the garment answers at the model's {asked.fps:g}")
+    return asked, shown
+
+
+def _at_rate(poses: PoseSequence, fps: float) -> PoseSequence:
+    return poses if same_rate(poses.fps, fps) else resample(poses, fps)
 
 
 def _open(output: Path, scene: _Scene, config: AnimateConfig, regressor: str, overwrite: bool) -> Stage:
@@ -210,7 +227,7 @@ def _open(output: Path, scene: _Scene, config: AnimateConfig, regressor: str, ov
     )
     body, poses = _motion_files(output)
     save_body(body, scene.person.body)
-    save_poses(poses, scene.motion)
+    save_poses(poses, scene.shown)
     return stage
 
 
@@ -237,8 +254,14 @@ class _Motion:
 def _animate(
     stage: Stage, scene: _Scene, coefficients: Float32[np.ndarray, "frames shapes"], config: AnimateConfig, workers: int
 ) -> StageResult:
-    """Write the garment, and the frames that are missing."""
-    known, motion = scene.known, scene.motion
+    """Write the garment, and the frames that are missing.
+
+    Args:
+        coefficients: of the motion's frames at the model's rate.
+    """
+    known, motion = scene.known, scene.shown
+    if motion is not scene.motion:
+        coefficients = coefficients_at(coefficients, seconds(scene.motion), seconds(motion))
     garment = known.model.garment
     template = garment.template.with_vertices(scene.mean.astype(np.float32))
     save_garment(stage.path / "garment.npz", replace(garment, template=template, body_shape=motion.shape))

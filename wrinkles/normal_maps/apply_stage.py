@@ -87,7 +87,7 @@ def run(
 
 def _prepare(weights: Path, work: WorkFolder, stage: Stage, config: ApplyConfig, template: MapTemplate) -> _Take:
     torch.set_num_threads(1)
-    return _Take(work, stage, config, MapMaker.create(load_model(weights), template))
+    return _Take(work, stage, config, MapMaker.create(load_model(weights), template, texels=config.texels))
 
 
 def _make(take: _Take, positions: range) -> int:

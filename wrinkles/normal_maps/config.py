@@ -35,6 +35,15 @@ class MapConfig:
     layout: Literal["auto", "keep", "pack"] = "auto"
     """UVs in the unit square are kept, patterns in metres packed into it (auto); or one of the two always."""
 
+    @property
+    def smallest(self) -> int:
+        """Texels at which islands that were laid out with this padding still have a texel of it."""
+        return -(-self.size // max(self.padding, 1))
+
+    def sized(self, size: int) -> MapConfig:
+        """The same layout at another number of texels, as much of it padding."""
+        return replace(self, size=size, padding=self.padding * size // self.size)
+
 
 @settings
 class ProjectionConfig:
@@ -142,6 +151,9 @@ class WrinkleConfig:
     """Frames between the two that belong to neither; neighbours are too alike."""
     texels: Count = 256
     """Side of the maps to learn; pairs are halved until they fit."""
+    crop: Whole = 0
+    """Side of the squares of them that a step learns from, wherever they lie; 0: whole maps. Maps are then made from
+    squares that overlap."""
     network: NetworkConfig = field(default_factory=NetworkConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)
@@ -160,6 +172,8 @@ _SMALL = WrinkleConfig(
 class ApplyConfig:
     """The form of the maps."""
 
+    texels: Count | None = None
+    """Along each side; those of the maps that the network's were made of if absent."""
     flip_green: bool = False
     """Y downwards, as DirectX and Unreal want it, instead of OpenGL's."""
     bits: Literal[8, 16] = 16

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from dataclasses import asdict
 from os import PathLike
 from pathlib import Path
@@ -22,7 +23,7 @@ from capture4d.types import Mesh
 from wrinkles.normal_maps.config import MapConfig, NetworkConfig
 from wrinkles.normal_maps.networks import UNet, set_test_statistics
 
-__all__ = ["WrinkleModel", "generator_path", "load_model", "save_model"]
+__all__ = ["WrinkleModel", "answer", "generator_path", "load_model", "save_model"]
 
 KIND = "a wrinkle generator"
 HALF_FROM = 32
@@ -40,6 +41,7 @@ class WrinkleModel:
         config: NetworkConfig,
         *,
         texels: int,
+        crop: int = 0,
         maps: MapConfig,
         layout_digest: str,
         template: Mesh,
@@ -47,7 +49,9 @@ class WrinkleModel:
         self.generator = generator
         self.config = config
         self.texels = texels
-        """Side of the maps the generator sees."""
+        """Side of the maps the generator learned from."""
+        self.crop = crop
+        """Side of the squares of them that it sees; 0: it sees them whole."""
         self.maps = maps
         """Of the maps on disk."""
         self.layout_digest = layout_digest
@@ -62,33 +66,79 @@ class WrinkleModel:
     def generate(
         self, low: Float[Tensor, "3 size size"], *, half_precision: bool | None = None
     ) -> Float[Tensor, "3 size size"]:
-        """Unit normals of a map; zero where `low` is. What a smaller generator adds is enlarged.
+        """Unit normals of a map; zero where `low` is. What a smaller generator adds is enlarged, bilinearly: `MapMaker`
+        heeds seams and makes maps of any size.
 
         Args:
             half_precision: layers in bfloat16; by default where it pays, from HALF_FROM filters up. A residual is added
                 in full precision.
         """
-        shown = (low != 0).any(dim=0, keepdim=True).float()[None]
-        image = low[None]
+        added = self.added(low, half_precision=half_precision)[None]
+        if added.shape[-1] != low.shape[-1]:
+            added = functional.interpolate(added, size=low.shape[-2:], mode="bilinear", align_corners=False)
+        return _unit(low[None] + added)[0] * (low != 0).any(dim=0)
+
+    @torch.inference_mode()
+    def added(
+        self, low: Float[Tensor, "3 size size"], *, half_precision: bool | None = None
+    ) -> Float[Tensor, "3 texels texels"]:
+        """What the generator adds to the unit normals of a map, at the scale it was trained at; zero where `low` is.
+
+        Args:
+            low: of as many texels as it was trained on, or twice as many, or four times, ...
+        """
+        image, shown = low[None], (low != 0).any(dim=0, keepdim=True).float()[None]
         while image.shape[-1] > self.texels:
             image, shown = _halved(image, shown)
         if half_precision is None:
             half_precision = self.config.filters >= HALF_FROM
         network = self._in_half_precision() if half_precision else self.generator
-        seen = image.to(torch.bfloat16) if half_precision else image
-        made = network.paint(seen.contiguous(memory_format=torch.channels_last)).float()
-        if network.output == "residual":
-            made = image + made
-        if image.shape[-1] != low.shape[-1]:
-            added = (_unit(made) - image) * shown
-            made = low + functional.interpolate(added, size=low.shape[-2:], mode="bilinear", align_corners=False)
-        return _unit(made)[0] * (low != 0).any(dim=0)
+        seen = (image.to(torch.bfloat16) if half_precision else image).contiguous(memory_format=torch.channels_last)
+        made = answer(network, seen, image, crop=self.crop)
+        return ((_unit(made) - image) * shown)[0]
 
     def _in_half_precision(self) -> UNet:
         """A copy of the generator, made once: the weights must not change any more."""
         if self._narrow is None:
             self._narrow = copy.deepcopy(self.generator).to(torch.bfloat16)
         return self._narrow
+
+
+def answer(network: UNet, seen: Tensor, low: Tensor, *, crop: int) -> Tensor:
+    """A network's maps, full precision, not yet of unit length.
+
+    Args:
+        seen: low maps in the network's precision; `low`, the same in full precision.
+        crop: side of the squares that it learned from; 0: whole maps.
+    """
+    painted = (_by_tiles(network.paint, seen, side=crop) if crop else network.paint(seen)).float()
+    return low + painted if network.output == "residual" else painted
+
+
+def _by_tiles(paint: Callable[[Tensor], Tensor], image: Tensor, *, side: int) -> Tensor:
+    """A network's answer to an image, from overlapping squares as large as those it learned from.
+
+    Where squares overlap, by a quarter of their side or more, their answers fade into one another along a raised
+    cosine. Squares that show nothing are left out, and stay zero.
+    """
+    size = image.shape[-1]
+    starts = [round(at) for at in np.linspace(0, size - side, tiles_along(size, side))]
+    fade = torch.sin(torch.pi * (torch.arange(side) + 0.5) / side).square().clamp(min=1e-3)
+    window = fade[:, None] * fade
+    total, weight = torch.zeros(image.shape), torch.zeros(size, size)
+    for top in starts:
+        tiles = [image[..., top : top + side, left : left + side] for left in starts]
+        seen = [(left, tile) for left, tile in zip(starts, tiles, strict=True) if tile.any()]
+        for left, tile in seen:
+            made = paint(tile.contiguous(memory_format=torch.channels_last)).float()
+            total[..., top : top + side, left : left + side] += window * made
+            weight[top : top + side, left : left + side] += window
+    return total / weight.clamp(min=1e-6)
+
+
+def tiles_along(size: int, side: int) -> int:
+    """Squares along an image of which neighbours overlap by a quarter of their side, or more."""
+    return 1 + max(-(-4 * (size - side) // (3 * side)), 0)
 
 
 def _unit(image: Tensor) -> Tensor:
@@ -106,6 +156,7 @@ def save_model(path: str | Path, model: WrinkleModel) -> None:
     about = {
         "network": asdict(model.config),
         "texels": model.texels,
+        "crop": model.crop,
         "maps": asdict(model.maps),
         "layout_digest": model.layout_digest,
     }
@@ -144,11 +195,12 @@ def load_model(path: str | PathLike[str]) -> WrinkleModel:
         faces = file.get(FACES)
         template = Mesh(file[VERTICES], np.zeros((0, 3), np.int32) if faces is None else faces, file.get(UV))
         texels = whole(file.entry("texels"), "texels", least=1)
+        crop = whole(file.entry("crop"), "crop") if "crop" in file.note else 0  # early versions saw maps whole
         layout = text(file.entry("layout_digest"), "layout_digest")
         if config.layers > len(weights):
             raise InputError(f"expected weights of {config.layers} layers, found {len(weights)} tensors")
     generator = filled(lambda: UNet(config), weights, source=path)
     return WrinkleModel(
         generator.to(memory_format=torch.channels_last),  # pyright: ignore[reportCallIssue]
-        config, texels=texels, maps=maps, layout_digest=layout, template=template,
+        config, texels=texels, crop=crop, maps=maps, layout_digest=layout, template=template,
     )  # fmt: skip

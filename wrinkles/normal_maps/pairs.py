@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
+from types import EllipsisType
 
 import numpy as np
 import torch
@@ -78,8 +79,16 @@ def fitted(take: PairTake, size: int) -> PairTake:
     while take.low.shape[-1] > size:
         take = halved(take)
     if take.low.shape[-1] != size:
-        raise InputError(f"{take.name}: expected maps of {size} texels times a power of two, found {found}")
+        raise InputError(f"{take.name}: {unfit(size, found)}")
     return take
+
+
+def unfit(size: int, found: int) -> str | None:
+    """What is wrong with maps of `found` texels for a network of `size`; None: halved often enough, they are of it."""
+    times, rest = divmod(found, size)
+    if not rest and times & (times - 1) == 0 and times:
+        return None
+    return f"expected maps of {size} texels times a power of two, found {found}"
 
 
 def halved(take: PairTake) -> PairTake:
@@ -111,24 +120,42 @@ def consecutive_pairs(takes: Sequence[PairTake]) -> list[tuple[int, int]]:
     return pairs
 
 
-def batches(takes: Sequence[PairTake], *, size: int, seed: int, start: int) -> Iterator[Batch]:
+def batches(takes: Sequence[PairTake], *, size: int, seed: int, start: int, crop: int = 0) -> Iterator[Batch]:
     """Random consecutive pairs without end, each once an epoch; batch `start` is the first.
 
     The same seed gives the same batches, wherever one starts.
+
+    Args:
+        crop: side of a square of each map, around a texel that is known; 0: the whole map.
     """
     pairs = consecutive_pairs(takes)
     position = start * size
     while True:
-        chosen = [pairs[_shuffled(len(pairs), seed, (position + i) // len(pairs))[(position + i) % len(pairs)]]
-                  for i in range(size)]  # fmt: skip
+        numbers = range(position, position + size)
+        chosen = [pairs[_shuffled(len(pairs), seed, number // len(pairs))[number % len(pairs)]] for number in numbers]
+        places = [
+            _square(takes[index].valid[at, 0], crop, np.random.default_rng([seed, number, crop])) if crop else ...
+            for number, (index, at) in zip(numbers, chosen, strict=True)
+        ]
         position += size
 
-        def stack(name: str, back: int = 0, chosen: list[tuple[int, int]] = chosen) -> Tensor:
-            return torch.stack([getattr(takes[index], name)[at - back] for index, at in chosen])
+        def stack(name: str, back: int = 0, chosen: list = chosen, places: list = places) -> Tensor:
+            parts = [getattr(takes[index], name)[at - back] for index, at in chosen]
+            return torch.stack([part[place] for part, place in zip(parts, places, strict=True)])
 
         yield Batch(
             stack("low").float(), stack("high").float(), stack("valid"), stack("high", 1).float(), stack("valid", 1)
         )
+
+
+def _square(
+    valid: Bool[Tensor, "size size"], side: int, random: np.random.Generator
+) -> tuple[EllipsisType, slice, slice]:
+    """A square of a map that holds one of its known texels, each as often as any other; it stays within the map."""
+    known = torch.nonzero(valid)
+    texel = known[random.integers(len(known))].numpy()
+    first = np.clip(texel - random.integers(side, size=2), 0, len(valid) - side)
+    return ..., slice(int(first[0]), int(first[0]) + side), slice(int(first[1]), int(first[1]) + side)
 
 
 def _shuffled(count: int, seed: int, epoch: int) -> np.ndarray:

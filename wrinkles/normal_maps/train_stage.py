@@ -25,13 +25,13 @@ from capture4d.geometry.uv_layout import millimetres_per_texel
 from capture4d.runs.progress import progress
 from capture4d.runs.stage import Stage, StageResult, open_stage
 from capture4d.types import Mesh
-from wrinkles.normal_maps.config import PairConfig, WrinkleConfig
-from wrinkles.normal_maps.inference import WrinkleModel, save_model
+from wrinkles.normal_maps.config import MapConfig, PairConfig, WrinkleConfig
+from wrinkles.normal_maps.inference import WrinkleModel, answer, save_model
 from wrinkles.normal_maps.maps_stage import ensure_pairs
 from wrinkles.normal_maps.maps_stage import run as make_pairs
 from wrinkles.normal_maps.metrics import MapScores, score
 from wrinkles.normal_maps.pair_files import PairFolder, open_pairs, surface_texels
-from wrinkles.normal_maps.pairs import PairTake, batches, consecutive_pairs, fitted, split
+from wrinkles.normal_maps.pairs import PairTake, batches, consecutive_pairs, split, unfit
 from wrinkles.normal_maps.spaces import to_colours
 from wrinkles.normal_maps.training import TrainingState, load_state, new_state, save_state, train_step
 
@@ -66,14 +66,14 @@ def run(
         raise InputError("wrinkles train: expected at least one work folder, found none")
     if len({work.path.resolve().name for work in works}) < len(works):
         raise InputError("wrinkles train: expected work folders of different names, found two alike")
-    folders = [_pairs(work, pairs, workers=workers) for work in works]
+    folders = [_pairs(work, pairs, config.texels, workers=workers) for work in works]
     first, *others = folders
     for folder in others:
         if folder.layout_digest != first.layout_digest:
             raise InputError(f"expected the UV layout of {first.work}, found another; one network needs one layout",
                              where=folder.work)  # fmt: skip
-    takes = [folder.read() for folder in folders]
-    parts = [split(fitted(take, config.texels), held_out=config.held_out, gap=config.held_out_gap) for take in takes]
+    takes = [folder.read(config.texels) for folder in folders]
+    parts = [split(take, held_out=config.held_out, gap=config.held_out_gap) for take in takes]
     consecutive_pairs([train for train, _ in parts])
     torch.set_num_threads(workers)
     state = new_state(config)
@@ -88,8 +88,8 @@ def run(
     recent = _resume(stage, state)
     _train(stage, state, recent, [train for train, _ in parts], [held for _, held in parts], config)
     model = WrinkleModel(
-        state.generator, config.network, texels=config.texels, maps=first.maps, layout_digest=first.layout_digest,
-        template=first.template,
+        state.generator, config.network, texels=config.texels, crop=config.crop, maps=first.maps,
+        layout_digest=first.layout_digest, template=first.template,
     )  # fmt: skip
     save_model(weights, model)
     measured = {}
@@ -101,12 +101,32 @@ def run(
     return stage.finish([weights])
 
 
-def _pairs(work: WorkFolder, config: PairConfig | None, *, workers: int) -> PairFolder:
-    """As they are if they are there, unless other settings than the default are asked for."""
+def _pairs(work: WorkFolder, config: PairConfig | None, texels: int, *, workers: int) -> PairFolder:
+    """As they are if they are there, unless other settings than the default are asked for; made large enough if not.
+
+    Raises:
+        InputError: halved, they are not of `texels` texels.
+    """
     if config is None or config == PairConfig():
-        return ensure_pairs(work, PairConfig(), workers=workers)
+        folder = ensure_pairs(work, PairConfig(map=large_enough(texels)), workers=workers)
+        problem = unfit(texels, folder.maps.size)
+        if problem is not None:
+            remade = f"capture4d wrinkles maps {work.path} --texels {large_enough(texels).size} --overwrite"
+            raise InputError(f"{problem}; run: {remade}", where=folder.path)
+        return folder
+    problem = unfit(texels, config.map.size)
+    if problem is not None:
+        raise InputError(f"pairs.map.size: {problem}")
     make_pairs(work, config, workers=workers)
     return open_pairs(work.path)
+
+
+def large_enough(texels: int) -> MapConfig:
+    """Maps of which a network of `texels` can be taught: the default's size, or more."""
+    size = texels
+    while size < MapConfig().size:
+        size *= 2
+    return MapConfig().sized(size)
 
 
 def learned_takes(model: Path) -> set[str]:
@@ -148,7 +168,7 @@ def _train(
     """
     schedule = config.schedule
     rows = _logged(stage.path / "metrics.jsonl", state.step)
-    stream = batches(train, size=schedule.batch, seed=config.seed, start=state.step)
+    stream = batches(train, size=schedule.batch, seed=config.seed, start=state.step, crop=config.crop)
     with progress("train", schedule.steps, completed=state.step) as advance:
         while state.step < schedule.steps:
             recent.append(train_step(state, next(stream), config))
@@ -210,7 +230,7 @@ def _write_samples(stage: Stage, state: TrainingState, held: list[PairTake], con
     with torch.inference_mode():
         for take, at in chosen:
             low = take.low[at].float()
-            made = state.generator(low[None])[0] * (low != 0).any(dim=0)
+            made = answer(state.generator, low[None], low[None], crop=config.crop)[0] * (low != 0).any(dim=0)
             row = torch.cat([low, made, take.high[at].float()], dim=2)
             rows.append(to_colours(row.permute(1, 2, 0).numpy()))
     torch.set_rng_state(random)

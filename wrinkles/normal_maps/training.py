@@ -41,10 +41,7 @@ class TrainingState:
 def new_state(config: WrinkleConfig) -> TrainingState:
     """Fresh networks; seeds torch's generator."""
     torch.manual_seed(config.seed)
-    layers = config.network.layers
-    if config.texels % 2**layers:
-        most = config.texels.bit_length() - 1
-        raise InputError(f"network.layers: expected at most {most} for maps of {config.texels} texels, found {layers}")
+    _require_fit(config)
     generator = UNet(config.network).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     discriminator = PatchDiscriminator(config.network).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     settings = config.schedule
@@ -53,6 +50,19 @@ def new_state(config: WrinkleConfig) -> TrainingState:
         return torch.optim.Adam(network.parameters(), lr=settings.learning_rate, betas=(settings.beta1, 0.999))
 
     return TrainingState(generator, discriminator, adam(generator), adam(discriminator))
+
+
+def _require_fit(config: WrinkleConfig) -> None:
+    """
+    Raises:
+        InputError: the network's layers do not halve the maps, or squares are larger than they.
+    """
+    layers, seen = config.network.layers, config.crop or config.texels
+    if seen > config.texels:
+        raise InputError(f"crop: expected at most the {config.texels} texels of the maps, found {seen}")
+    if seen % 2**layers:
+        most, what = (seen & -seen).bit_length() - 1, "squares" if config.crop else "maps"
+        raise InputError(f"network.layers: expected at most {most} for {what} of {seen} texels, found {layers}")
 
 
 def train_step(state: TrainingState, batch: Batch, config: WrinkleConfig) -> dict[str, float]:

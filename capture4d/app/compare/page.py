@@ -23,7 +23,7 @@ import torch
 
 from capture4d.app.compare.config import CompareConfig
 from capture4d.app.compare.inputs import open_inputs
-from capture4d.app.compare.measures import Row, measure, true_vertices
+from capture4d.app.compare.measures import Row, conclusion, measure, true_vertices
 from capture4d.app.compare.methods import methods
 from capture4d.app.compare.pictures import Pictures, draw
 from capture4d.app.compare.table import LEARNED, comparison_table
@@ -102,6 +102,7 @@ def _write_table(
             "frames": frame_ids,
             "against_truth": against_truth,
             "methods": [asdict(row) for row in table],
+            "conclusion": conclusion(table, against_truth=against_truth),
             "pictures": kept,
             "people": people,
         },
@@ -148,5 +149,6 @@ def _write_page(
         people=pictures.people,
         middle=pictures.people_frame,
         left_out=left_out,
+        conclusion=conclusion(table, against_truth=against_truth),
     )
     write_bytes(path, page.encode())

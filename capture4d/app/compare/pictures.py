@@ -140,7 +140,7 @@ class _Frame:
         return data_uri(render([Drawn(mesh, normal_map=normal_map)], view, width=WIDTH, height=HEIGHT))
 
     def _tangent_image(self, normals: np.ndarray, vertices: np.ndarray) -> np.ndarray:
-        return self.template.tangent_image(normals, self.template.frames(vertices)).astype(np.float32)
+        return self.template.tangent_image(normals, vertices)
 
 
 def _map_errors(template: MapTemplate, methods: Sequence[Method], held: PairTake, at: int) -> dict[str, np.ndarray]:

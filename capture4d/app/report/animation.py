@@ -6,6 +6,7 @@ import platform
 from collections.abc import Mapping, Sequence
 from functools import partial
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from capture4d.app.report.take_page import flat, metrics_table
 from capture4d.body.skinning import pose_frame, with_shape
 from capture4d.captures.work_folder import ANIMATE, VERDICTS, WorkFolder
 from capture4d.files.atomic import write_bytes, write_json
+from capture4d.motions.sources import acknowledgement
 from capture4d.runs.stage import StageResult, open_stage, require_complete, result_of
 from capture4d.runs.workers import run_jobs, shared
 
@@ -120,7 +122,8 @@ def _page(
         title=work.path.resolve().name,
         subtitle=f"{len(records)} frames, {len(records) / poses.fps:.1f} s at {poses.fps:g} fps; a learned garment of "
         f"{len(template.vertices):,} vertices on a body of shape "
-        f"{', '.join(f'{value:.2g}' for value in poses.shape[:4])}.",
+        f"{', '.join(f'{value:.2g}' for value in poses.shape[:4])}. "
+        f"{acknowledgement(Path(stage['sources']['poses'])) or ''}",
         tiles=[
             Tile(shown(summary[key]), ANIMATION_METRICS[key][0], name)
             for key, name in (

@@ -109,6 +109,7 @@ class Comparison:
     pictures: Sequence[tuple[int, Sequence[Panel]]]
     people: Sequence[Panel]
     people_frame: int
+    conclusion: str
 
 
 def comparison(work: Path) -> Comparison | None:
@@ -128,6 +129,7 @@ def comparison(work: Path) -> Comparison | None:
         [(frame["frame_id"], panels(frame)) for frame in found["pictures"]],
         panels(found["people"]),
         found["people"]["frame_id"],
+        found.get("conclusion", ""),  # which earlier versions did not draw
     )
 
 

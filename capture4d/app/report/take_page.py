@@ -178,6 +178,7 @@ def _comparison_part(compared: Comparison | None) -> dict[str, Any] | None:
         f"against {against}.",
         "table": comparison_table(compared.rows),
         "learned": LEARNED if any(row["learned"] for row in compared.rows) else "",
+        "conclusion": compared.conclusion,
         "pictures": compared.pictures,
         "people": compared.people,
         "people_frame": compared.people_frame,

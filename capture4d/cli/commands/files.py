@@ -162,7 +162,7 @@ class ConvertPoses(FileOptions):
     format: Literal["poses", "amass"] = "poses"
     """What kind of .npz to write."""
     fps: Positive | None = None
-    """Frame rate of the result; that of the input if absent. Of an input that tells no rate, its own."""
+    """Frame rate to resample to; that of the input if absent. Of an input that tells no rate, its own."""
     names: str = "auto"
     """Whose names a BVH's joints have: `auto` finds out; mixamo, cmu, lafan, rokoko, xsens, smpl, biped, unreal, unity,
     motive, neuron, blender, daz, vicon, mocopi, makehuman; or a JSON file, our joint: their joint."""
@@ -176,13 +176,13 @@ class ConvertPoses(FileOptions):
         from capture4d.files.outputs import new_files
         from capture4d.files.records import load_body
         from capture4d.motions.clips import MotionWords
-        from capture4d.motions.motion_files import read_motion, write_motion
+        from capture4d.motions.motion_files import read_motion, told, write_motion
 
         body = load_body(self.body) if self.body else load_anny()
         words = MotionWords.of(self.names, self.up, self.facing)
         named = Path(self.names) if self.names.lower().endswith(".json") else None
         with new_files([self.output], inputs=[self.input, self.body, named], overwrite=self.overwrite) as workshop:
-            poses = read_motion(self.input, body, fps=self.fps, words=words, say=lambda note: print(f"read: {note}"))
+            poses = read_motion(self.input, body, fps=self.fps, words=words, say=told(self.input))
             write_motion(workshop / self.output.name, body, poses, amass=self.format == "amass")
         print(f"{len(poses.frame_ids)} poses at {poses.fps:g} fps: {self.output}")
         return GOOD

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -11,6 +11,7 @@ from tyro.conf import Positional, arg
 from capture4d.app.compare.config import CompareConfig
 from capture4d.cli.exit_codes import GOOD
 from capture4d.cli.options import MeshOptions, StageOptions, all_cores
+from capture4d.errors import CommandLineError
 from capture4d.settings import Count
 from wrinkles.normal_maps import config as wrinkle_config
 from wrinkles.normal_maps.config import PairConfig, WrinkleConfig
@@ -31,13 +32,25 @@ class WrinklesMaps(StageOptions, MeshOptions):
     """Work folder; holds garment/ and registration/, gets wrinkles/pairs/."""
     high_from: Path | None = None
     """Work folder of the same frames, with finished maps, whose high ones are taken."""
+    texels: Count | None = None
+    """Along each side of the maps: --pairs.map.size, and as much more padding."""
     config: Annotated[PairConfig, arg(name="pairs")] = field(default_factory=PairConfig)
 
     def __call__(self) -> int:
         from capture4d import pipeline
 
+        maps, usual = self.config.map, wrinkle_config.MapConfig()
+        if self.texels is not None and maps.size not in (usual.size, self.texels):
+            raise CommandLineError(f"--texels: expected the {maps.size} of --pairs.map.size, or one of the two alone, "
+                                   f"found {self.texels}")  # fmt: skip
+        if self.texels is not None and maps.size == usual.size:
+            maps = maps.sized(self.texels)
         result = pipeline.wrinkles_maps(
-            self.work, self.config, high_from=self.high_from, workers=self.workers, overwrite=self.overwrite
+            self.work,
+            replace(self.config, map=maps),
+            high_from=self.high_from,
+            workers=self.workers,
+            overwrite=self.overwrite,
         )
         print(f"maps: {result.path}")
         return GOOD
@@ -76,6 +89,8 @@ class WrinklesApply(StageOptions, MeshOptions):
     """Model folder of `wrinkles train`, or its generator.safetensors."""
     work: Annotated[Positional[Path], arg(metavar="WORK")]
     """Work folder; holds registration/, gets wrinkles/generated/."""
+    texels: Count | None = None
+    """Along each side of the maps, such as 1024; those of the maps that MODEL's were made of if absent."""
     flip_green: bool = False
     """Y downwards, as DirectX and Unreal want it, instead of OpenGL's."""
     bits: Literal[8, 16] = 16
@@ -84,7 +99,7 @@ class WrinklesApply(StageOptions, MeshOptions):
     def __call__(self) -> int:
         from capture4d import pipeline
 
-        config = wrinkle_config.ApplyConfig(flip_green=self.flip_green, bits=self.bits)
+        config = wrinkle_config.ApplyConfig(self.texels, flip_green=self.flip_green, bits=self.bits)
         result = pipeline.wrinkles_apply(self.model, self.work, config, workers=self.workers, overwrite=self.overwrite)
         print(f"maps: {result.path / 'frames'}")
         return GOOD

@@ -3,7 +3,7 @@
 import numpy as np
 
 from capture4d.geometry.mesh import vertex_normals
-from capture4d.geometry.tangents import TangentLayout, corner_tangents, tangent_frames
+from capture4d.geometry.tangents import TangentLayout, corner_tangents, frames_at
 from capture4d.geometry.uv_raster import rasterise_uv
 from capture4d.types import Mesh
 
@@ -50,8 +50,13 @@ def test_frames_turn_with_the_mesh_and_are_orthonormal():
     raster, layout = rasterise_uv(mesh, 32), TangentLayout(mesh.faces, mesh.uv)
     turn = np.linalg.qr(np.random.default_rng(1).standard_normal((3, 3)))[0]
     turn *= np.sign(np.linalg.det(turn))
-    frames = tangent_frames(raster, layout, mesh.vertices)
-    turned = tangent_frames(raster, layout, mesh.vertices.astype(float) @ turn.T)
+
+    def frames_of(vertices: np.ndarray) -> np.ndarray:
+        normals = vertex_normals(vertices, mesh.faces)
+        tangents = layout.tangents(vertices, normals)
+        return frames_at(layout, raster.faces, raster.barycentric, normals=normals, tangents=tangents)
+
+    frames, turned = frames_of(mesh.vertices.astype(float)), frames_of(mesh.vertices.astype(float) @ turn.T)
     np.testing.assert_allclose(turned, frames @ turn.T, atol=1e-6)
     np.testing.assert_allclose(frames @ frames.transpose(0, 2, 1), np.broadcast_to(np.eye(3), frames.shape), atol=1e-9)
     np.testing.assert_allclose(np.linalg.det(frames), 1, atol=1e-9)

@@ -199,6 +199,20 @@ def test_resampling_at_the_same_rate_changes_nothing() -> None:
     np.testing.assert_allclose(doubled.rotations[::2], poses.rotations, atol=1e-6)
 
 
+def test_resampling_is_told_and_nothing_else_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source, out = tmp_path / "walk.npz", tmp_path / "out.npz"
+    save_poses(source, random_poses(load_anny(), 6, frames=7))
+    line = f"capture4d: {source}: 60 frames a second, resampled to 20: 7 frames became 3\n"
+    for fps, said in ((20.0, line), (60.0, ""), (60.0 * (1 + 1e-5), "")):
+        assert run("convert-poses", source, out, "--fps", fps) == 0
+        assert capsys.readouterr().err == said
+    assert run("convert-poses", source, out) == 0
+    assert capsys.readouterr().err == ""
+    notes: list[str] = []
+    assert len(read_motion(source, load_anny(), fps=30.0, say=notes.append).frame_ids) == 4
+    assert notes == ["60 frames a second, resampled to 30: 7 frames became 4"]
+
+
 @pytest.mark.parametrize(("own", "fps"), [(60.0, 1e12), (0.01, 1e5), (60.0, np.inf)])
 def test_a_rate_that_is_none_asks_for_no_memory(own: float, fps: float, tmp_path: Path) -> None:
     save_poses(tmp_path / "poses.npz", replace(random_poses(load_anny(), 6), fps=own))
@@ -287,9 +301,9 @@ def test_joints_and_axes_may_be_told(strange: Path, capsys: pytest.CaptureFixtur
     assert "--names takes a JSON file" in fails(capsys, "convert-poses", strange / "in.bvh", out)
     how = ("--names", strange / "names.json", "--up", "z", "--facing", "-y")
     assert run("convert-poses", strange / "in.bvh", out, *how) == 0
-    said = capsys.readouterr().out.splitlines()
-    assert "Z up, -Y forward; in centimetres" in said[0]
-    assert said[1] == f"6 poses at 30 fps: {out}"
+    printed = capsys.readouterr()
+    assert "Z up, -Y forward; in centimetres" in printed.err
+    assert printed.out == f"6 poses at 30 fps: {out}\n"
     (strange / "plain.bvh").write_text(text(walk().called(TOOLS["cmu"])))
     body = load_anny()
     found, expected = (centres(body, read_motion(strange / name, body)) for name in ("out.npz", "plain.bvh"))

@@ -199,12 +199,43 @@ def test_cloth_does_not_stretch_unless_it_is_let_and_torn_cloth_has_failed(model
     assert stretch[1.2] < 2
 
 
-def test_a_motion_at_another_rate_is_resampled(model: Path, motion, tmp_path: Path) -> None:
+def test_a_motion_at_another_rate_is_resampled_and_told(model: Path, motion, tmp_path: Path, capsys) -> None:
     save_poses(tmp_path / "slow.npz", replace(motion(10, 1), fps=30.0))
     assert run(*animate(model, tmp_path / "slow.npz", tmp_path / "slow")) == 0
+    line = "slow.npz: 30 frames a second, resampled to the model's 60: 10 frames became 19\n"
+    assert line in capsys.readouterr().err
     motion_ = open_work(tmp_path / "slow").require_posed_body()[1]
     assert motion_.fps == 60.0
     assert len(motion_.frame_ids) == 19
+
+
+def test_a_motion_may_come_out_at_any_rate(model: Path, motion, tmp_path: Path, capsys) -> None:
+    """At the model's frames nothing changes; between them, the body is that of the file's own frames."""
+    fast = motion(33, 1, 240.0)
+    save_poses(tmp_path / "fast.npz", fast)
+    out = {}
+    for fps in (60, 120, 240, 30):
+        assert run(*animate(model, tmp_path / "fast.npz", tmp_path / str(fps), "--fps", fps, "--removal.no-enabled",
+                            "--longest", "0")) == 0  # fmt: skip
+        out[fps] = capsys.readouterr().err, open_work(tmp_path / str(fps))
+    own = out[60][1]
+    for fps, (said, work) in out.items():
+        poses, vertices = work.require_posed_body()[1], np.array(work.registered.vertices)
+        assert poses.fps == fps
+        assert len(vertices) == 32 * fps // 240 + 1
+        source, step = 240 // fps, max(fps // 60, 1)
+        np.testing.assert_allclose(poses.rotations, fast.rotations[::source], atol=1e-5)
+        np.testing.assert_allclose(vertices[::step], own.registered.vertices[:: max(60 // fps, 1)], atol=1e-6)
+        expected = {
+            30: "240 frames a second, resampled to 30: 33 frames became 5; the garment answers at the model's 60",
+            60: "240 frames a second, resampled to 60: 33 frames became 9",
+            120: "240 frames a second, resampled to 120: 33 frames became 17; the garment answers at the model's 60",
+            240: "240 frames a second, as wanted; the garment answers at the model's 60",
+        }
+        assert f"fast.npz: {expected[fps]}\n" in said
+    assert "--fps: expected a positive number" in fails(
+        capsys, *animate(model, tmp_path / "fast.npz", tmp_path / "none", "--fps", "0")
+    )
 
 
 def test_poses_of_another_skeleton_are_one_line(model: Path, motion, tmp_path: Path, capsys) -> None:

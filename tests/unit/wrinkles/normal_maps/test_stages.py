@@ -22,6 +22,7 @@ from capture4d.files.atomic import read_json, write_bytes, write_json, write_npy
 from capture4d.files.records import load_garment, save_garment
 from capture4d.files.tensors import read_tensors, write_tensors
 from capture4d.geometry.mesh import submesh
+from capture4d.geometry.uv_raster import sample_bilinear
 from capture4d.runs.stage import open_stage
 from capture4d.types import Garment, Mesh
 from tests.command_line import fails, run
@@ -39,7 +40,7 @@ from wrinkles.normal_maps.display import fill_holes
 from wrinkles.normal_maps.inference import KIND, load_model
 from wrinkles.normal_maps.spaces import decode_png, encode_png
 from wrinkles.normal_maps.template import MapTemplate
-from wrinkles.normal_maps.wrinkle_maps import wrinkle_map
+from wrinkles.normal_maps.wrinkle_maps import MapMaker, wrinkle_map
 
 SMALL = ["--pairs.map.size", "64", "--texels", "32", "--network.filters", "4", "--network.layers", "5",
          "--schedule.steps", "6", "--schedule.checkpoint-every", "2", "--schedule.sample-every", "3",
@@ -270,6 +271,85 @@ def test_green_is_flipped_on_demand_and_delivery_is_8_bit(work: Path, trained: P
     pixels = cv2.imread(str(frame), cv2.IMREAD_UNCHANGED)
     assert pixels.dtype == np.uint8
     assert np.abs(pixels[..., ::-1] / 127.5 - 1 - up).max() < 0.01
+
+
+@pytest.mark.parametrize("texels", [64, 100, 256])
+def test_maps_come_in_the_size_that_is_wanted(work: Path, trained: Path, texels: int):
+    """What the network says is the same at every size; what the garment says is exact."""
+    assert run("wrinkles", "apply", trained, work, "--workers", "1", "--texels", texels) == 0
+    frame = work / "wrinkles" / "generated" / "frames" / "000001.png"
+    image = decode_png(frame.read_bytes(), source="map")[0]
+    assert image.shape == (texels, texels, 3)
+    vertices = np.array(load_registration(work / "registration").vertices[0])
+    np.testing.assert_allclose(image, wrinkle_map(trained, vertices, texels=texels), atol=1e-4)
+    kept = load_model(trained)
+    large = MapMaker.create(kept, MapTemplate.laid_out(kept.template, kept.maps), texels=texels)
+    small = MapMaker.create(kept, MapTemplate.laid_out(kept.template, kept.maps))
+    uv = np.random.default_rng(0).uniform(0.1, 0.3, (200, 2))  # well within the first island
+    found, wanted = (
+        sample_bilinear(maker.template.raster.image(maker.normals(vertices)), uv) for maker in (large, small)
+    )
+    assert np.degrees(np.linalg.norm(found - wanted, axis=1)).max() < 3
+
+
+def test_a_network_without_anything_to_say_leaves_maps_flat_at_every_size(trained: Path, work: Path):
+    kept = load_model(trained)
+    for weights in kept.generator.up[-1].parameters():
+        weights.data.zero_()
+    vertices = np.array(load_registration(work / "registration").vertices[0])
+    for texels in (64, 300):
+        image = wrinkle_map(kept, vertices, texels=texels)
+        np.testing.assert_allclose(image, np.broadcast_to([0, 0, 1], image.shape), atol=2e-3)
+
+
+def test_sizes_that_cannot_be_are_one_line(work: Path, trained: Path, tmp_path: Path, capsys):
+    for texels in (15, 8193):
+        line = fails(capsys, "wrinkles", "apply", trained, work, "--workers", "1", "--texels", texels)
+        assert f"texels: expected from 16, so that the layout's islands stay apart, to 8192, found {texels}" in line
+    assert not (work / "wrinkles" / "generated").exists()
+    line = fails(capsys, "wrinkles", "maps", work, "--texels", "128", "--pairs.map.size", "64", "--workers", "1")
+    assert "--texels: expected the 64 of --pairs.map.size, or one of the two alone, found 128" in line
+    line = fails(capsys, *train(work, tmp_path / "x", "--crop", "48"))
+    assert "crop: expected at most the 32 texels of the maps, found 48" in line
+    assert run("wrinkles", "maps", work, "--texels", "64", "--workers", "1") == 0
+    assert read_json(work / "wrinkles" / "pairs" / "stage.json")["config"]["map"]["padding"] == 1
+    line = fails(capsys, "wrinkles", "train", work, "--output", tmp_path / "x", "--texels", "128", "--workers", "1")
+    assert (
+        f"expected maps of 128 texels times a power of two, found 64; run: capture4d wrinkles maps {work} --texels "
+        in line
+    )
+    assert line.endswith("--texels 256 --overwrite")
+
+
+def test_a_network_learns_from_squares_and_is_asked_by_squares(work: Path, tmp_path: Path):
+    """Maps large enough are made for it."""
+    model = tmp_path / "squares"
+    more = ("--texels", "512", "--crop", "32", "--network.filters", "4", "--network.layers", "5", "--held-out", "0.2",
+            "--schedule.steps", "4", "--schedule.sample-every", "4", "--workers", "1")  # fmt: skip
+    assert run("wrinkles", "train", work, "--output", model, *more) == 0
+    assert read_json(work / "wrinkles" / "pairs" / "stage.json")["config"]["map"]["size"] == 512
+    kept = load_model(model)
+    assert (kept.texels, kept.crop, kept.maps.padding) == (512, 32, 8)
+    vertices = np.array(load_registration(work / "registration").vertices[0])
+    template = MapTemplate.laid_out(kept.template, kept.maps)
+    low = torch.from_numpy(template.raster.image(template.low_normals(vertices))).permute(2, 0, 1)
+    added = kept.added(low)
+    assert added.shape == low.shape
+    assert not added[:, ~(low != 0).any(dim=0)].any()
+    assert wrinkle_map(model, vertices).shape == (512, 512, 3)
+
+
+def test_many_maps_lie_in_a_file_and_read_the_same(work: Path, monkeypatch: pytest.MonkeyPatch):
+    assert run("wrinkles", "maps", work, "--pairs.map.size", "64", "--workers", "1") == 0
+    folder = pair_files.open_pairs(work)
+    there = sorted(path.name for path in folder.path.iterdir())
+    wanted = folder.read(32)
+    monkeypatch.setattr(pair_files, "MAPPED_FROM", 1000)
+    found = folder.read(32)
+    assert found.low.untyped_storage().nbytes() == wanted.low.untyped_storage().nbytes()
+    for name in ("low", "high", "valid"):
+        torch.testing.assert_close(getattr(found, name), getattr(wanted, name), rtol=0, atol=0)
+    assert sorted(path.name for path in folder.path.iterdir()) == there
 
 
 def test_maps_of_an_animation_do_not_hang_on_its_template(work: Path, trained: Path, tmp_path: Path):

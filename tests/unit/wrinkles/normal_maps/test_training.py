@@ -1,6 +1,7 @@
 """A network learns one pair by heart; a run that was interrupted goes on as if it had not been."""
 
 import copy
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from wrinkles.normal_maps.config import (
     TemporalLoss,
     WrinkleConfig,
 )
+from wrinkles.normal_maps.inference import answer
 from wrinkles.normal_maps.losses import data_loss, gan_loss, temporal_loss
 from wrinkles.normal_maps.pairs import PairTake, augmented, batches, fitted, halved, split
 from wrinkles.normal_maps.training import TrainingState, learning_rate, load_state, new_state, save_state, train_step
@@ -128,6 +130,69 @@ def test_batches_are_the_same_from_wherever_one_starts_and_epochs_are_complete()
     torch.testing.assert_close(first[4].low, later.low)
     lows = torch.cat([batch.low for batch in first[:3]]).flatten(1)
     assert len(torch.unique(lows, dim=0)) == 6  # 6 consecutive pairs of 7 frames, each once
+
+
+def test_squares_are_the_same_place_of_every_map_and_reach_everywhere():
+    one = take(7)
+    rows, columns = np.mgrid[:32, :32].astype(np.float16) / 32
+    where = torch.from_numpy(np.stack([rows, columns, np.ones_like(rows)]))
+    marked = replace(one, low=where.expand(7, 3, 32, 32), high=where.expand(7, 3, 32, 32))
+    stream = batches([marked], size=2, seed=3, start=0, crop=8)
+    starts = []
+    for batch, _ in zip(stream, range(60), strict=False):
+        assert batch.low.shape == batch.previous.shape == (2, 3, 8, 8)
+        assert batch.valid.shape == batch.previous_valid.shape == (2, 1, 8, 8)
+        torch.testing.assert_close(batch.low, batch.high)
+        torch.testing.assert_close(batch.low, batch.previous)
+        assert batch.valid.flatten(1).any(dim=1).all()
+        starts += (32 * batch.low[:, :2, 0, 0]).tolist()
+    assert np.ptp(starts, axis=0).min() >= 20
+    later = next(batches([marked], size=2, seed=3, start=4, crop=8))
+    again = next(stream for stream in [batches([marked], size=2, seed=3, start=0, crop=8)])
+    for _ in range(4):
+        next(again)
+    torch.testing.assert_close(next(again).low, later.low)
+
+
+def test_squares_must_fit_the_maps_and_the_network():
+    for crop, layers, said in (
+        (64, 5, "crop: expected at most the 32 texels of the maps, found 64"),
+        (24, 5, "network.layers: expected at most 3 for squares of 24 texels, found 5"),
+    ):
+        with pytest.raises(InputError, match=said):
+            new_state(replace(CONFIG, crop=crop, network=replace(CONFIG.network, layers=layers)))
+
+
+def by_squares(paint: Callable[[torch.Tensor], torch.Tensor], image: torch.Tensor, side: int) -> torch.Tensor:
+    """What a network of squares makes of an image."""
+
+    class Painter:
+        output = "absolute"
+
+    painter = Painter()
+    painter.paint = paint  # pyright: ignore[reportAttributeAccessIssue]
+    return answer(painter, image, image, crop=side)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize(("size", "side"), [(32, 32), (32, 8), (30, 8), (40, 16)])
+def test_squares_cover_a_map_and_fade_into_one_another(size: int, side: int):
+    image = torch.rand(1, 3, size, size, generator=torch.Generator().manual_seed(0)) + 0.1
+    torch.testing.assert_close(by_squares(lambda tile: 2 * tile, image, side), 2 * image)
+    seen = []
+
+    def numbered(tile: torch.Tensor) -> torch.Tensor:
+        assert tile.shape[-2:] == (side, side)
+        seen.append(tile)
+        return torch.full_like(tile, float(len(seen)))
+
+    made = by_squares(numbered, image, side)[0, 0]
+    if side < size:  # neighbours differ by whole numbers; the map goes from one to the other in steps
+        assert made[0].diff().abs().max() < 0.9
+    half = image.clone()
+    half[..., : size // 2, :] = 0
+    before = len(seen)
+    assert not by_squares(numbered, half, side)[..., : size // 2 - side, :].any()
+    assert len(seen) - before <= before
 
 
 def test_the_frame_before_is_the_frame_before():
