@@ -42,7 +42,6 @@ from retarget.regression.learning import (
     UnposedTakes,
     fitting_clips,
     learn_shapes,
-    learned_stretch,
     predictions,
     regression_clips,
     training_poses,
@@ -57,7 +56,7 @@ from retarget.shapes.mirroring import Mirror, find_mirror
 
 __all__ = ["run"]
 
-SCHEMA = 5
+SCHEMA = 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -214,8 +213,7 @@ def _regressors(
         kernel = load_kernel(stage.path / KERNEL, model_digest=digest)
     if config.regressor == "all":
         network = _network(stage, clips, linear, space, config, device)
-    stretch = learned_stretch(lesson.takes, lesson.pieces, space, lesson.garment.template.faces)
-    known = KnownRange(poses, ranges, CoefficientRange.of(clips.all, space.std), stretch)
+    known = KnownRange(poses, ranges, CoefficientRange.of(clips.all, space.std))
     save_known_range(stage.path / POSES, known, model_digest=digest)
     note: dict[str, Any] = {
         "mirrored": mirror is not None,

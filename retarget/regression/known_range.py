@@ -274,8 +274,6 @@ class KnownRange:
     controls: Mapping[str, ControlRange]
     """By the regressor that they drive; the network's are those of the linear regression."""
     coefficients: CoefficientRange
-    stretch_p99: float
-    """Edge length over the mean garment's, 99th percentile, of the learned frame in which it is largest."""
 
     @property
     def safe_deg(self) -> float:
@@ -314,7 +312,6 @@ def save_known_range(path: Path, known: KnownRange, *, model_digest: str) -> Non
         "joints": list(poses.joints),
         "validated_deg": poses.validated_deg,
         "length": coefficients.length,
-        "stretch_p99": known.stretch_p99,
         "controls": sorted(known.controls),
         "model": model_digest,
     }
@@ -343,15 +340,14 @@ def load_known_range(path: Path, *, model_digest: str) -> KnownRange:
             PoseRange(quaternions, joints, _amount(file, "validated_deg")),
             {name: _control_range(file, name) for name in names},
             _coefficient_range(file),
-            _amount(file, "stretch_p99", above=True),
         )
 
 
-def _amount(file: TensorFile, name: str, *, above: bool = False) -> float:
-    """A number of the note, not below 0; or above it."""
+def _amount(file: TensorFile, name: str) -> float:
+    """A number of the note, not below 0."""
     found = number(file.entry(name), name)
-    if found < 0 or (above and found == 0):
-        raise InputError(f"expected {name} {'above' if above else 'from'} 0, found {found:g}")
+    if found < 0:
+        raise InputError(f"expected {name} from 0, found {found:g}")
     return found
 
 

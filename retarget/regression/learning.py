@@ -9,9 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int64
 
-from capture4d.geometry.mesh import unique_edges
 from capture4d.types import PoseSequence
 from retarget.config import ShapeConfig
 from retarget.regression.controls import ControlLayout, control_vectors
@@ -24,7 +23,6 @@ from retarget.shapes.blendshapes import (
     learn_shape_space,
     posed_errors,
     project,
-    skin_frames,
 )
 from retarget.shapes.mirroring import Mirror
 
@@ -34,16 +32,11 @@ __all__ = [
     "UnposedTakes",
     "fitting_clips",
     "learn_shapes",
-    "learned_stretch",
     "predictions",
     "regression_clips",
     "training_poses",
     "vertex_error_m",
 ]
-
-
-STRETCH_FRAMES = 100
-"""Of the learned frames, evenly spread, that are looked at for how far cloth stretches."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -191,20 +184,6 @@ def vertex_error_m(
             errors = posed_errors(residual[None], takes.skin_weights, take.transforms[frame][None])[0, seen]
             total, count = total + float(errors.sum()), count + int(seen.sum())
     return total / max(count, 1)
-
-
-def learned_stretch(
-    takes: UnposedTakes, pieces: Sequence[Piece], space: ShapeSpace, faces: Int32[np.ndarray, "faces 3"]
-) -> float:
-    """How far edges stretch in what is learned from: their length in the pose over the mean garment's, 99th percentile
-    of the frame in which that is largest, of some frames."""
-    rows = takes.rows(pieces, "training")
-    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), STRETCH_FRAMES)).round().astype(int)]
-    edges = unique_edges(faces)
-    usual = np.maximum(np.linalg.norm(space.mean[edges[:, 0]] - space.mean[edges[:, 1]], axis=1), 1e-9)
-    placed = skin_frames(takes.vertices[rows], takes.skin_weights, takes.transforms[rows])
-    lengths = np.linalg.norm(placed[:, edges[:, 0]] - placed[:, edges[:, 1]], axis=2)
-    return float(np.percentile(lengths / usual, 99, axis=1).max())
 
 
 def training_poses(

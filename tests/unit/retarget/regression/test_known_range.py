@@ -157,10 +157,10 @@ def test_frames_one_by_one_are_the_motion_at_once(bounded, layout, motion) -> No
 
 def test_it_comes_back_from_its_file(bounded, layout, motion, tmp_path: Path) -> None:
     poses = PoseRange(pose_quaternions(motion(9, 1).rotations, (1, 2)), (1, 2), 7.5)
-    known = KnownRange(poses, {"linear": bounded.controls}, bounded.coefficients, 1.25)
+    known = KnownRange(poses, {"linear": bounded.controls}, bounded.coefficients)
     save_known_range(tmp_path / "poses.safetensors", known, model_digest="a")
     found = load_known_range(tmp_path / "poses.safetensors", model_digest="a")
-    assert (found.safe_deg, found.stretch_p99, found.poses.joints) == (10.0, 1.25, (1, 2))
+    assert (found.safe_deg, found.poses.joints) == (10.0, (1, 2))
     np.testing.assert_array_equal(found.controls["linear"].poses, bounded.controls.poses)
     np.testing.assert_array_equal(found.coefficients.largest, bounded.coefficients.largest)
     controls = control_vectors(layout, turned(motion(9, 9), 30.0))
@@ -185,7 +185,7 @@ def test_a_range_of_another_regressor_is_one_line(bounded, layout, motion, said:
     if said == "a part less":
         controls = replace(controls, largest=controls.largest[:-1])
     shapes = len(bounded.coefficients.std)
-    known = KnownRange(replace(poses, joints=layout.joints), {"linear": controls}, bounded.coefficients, 1.25)
+    known = KnownRange(replace(poses, joints=layout.joints), {"linear": controls}, bounded.coefficients)
     if said == "a joint more":
         known, layout = replace(known, poses=poses), replace(layout, joints=(1, 3))
     with pytest.raises(InputError, match=fault):
@@ -194,5 +194,5 @@ def test_a_range_of_another_regressor_is_one_line(bounded, layout, motion, said:
 
 def test_a_range_of_its_own_regressor_is_taken(bounded, layout, motion) -> None:
     poses = PoseRange(pose_quaternions(motion(9, 1).rotations, layout.joints), layout.joints, 7.5)
-    known = KnownRange(poses, {"linear": bounded.controls}, bounded.coefficients, 1.25)
+    known = KnownRange(poses, {"linear": bounded.controls}, bounded.coefficients)
     known.require("linear", layout, len(bounded.coefficients.std))
