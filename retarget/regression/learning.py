@@ -5,7 +5,7 @@ The arrays of all takes lie one after the other; a `Take` says where its frames 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +14,14 @@ from jaxtyping import Bool, Float, Float32, Float64, Int64
 from capture4d.types import PoseSequence
 from retarget.config import ShapeConfig
 from retarget.regression.controls import ControlLayout, control_vectors
-from retarget.regression.known_range import PoseRange, nearest_poses, pose_quaternions
+from retarget.regression.known_range import (
+    CoefficientRange,
+    ControlRange,
+    PoseRange,
+    Trust,
+    nearest_poses,
+    pose_quaternions,
+)
 from retarget.regression.regressors import Clip, FittingClips, Regressor
 from retarget.regression.splits import Piece, Role
 from retarget.shapes.blendshapes import (
@@ -30,6 +37,7 @@ __all__ = [
     "Projected",
     "Take",
     "UnposedTakes",
+    "examined",
     "fitting_clips",
     "learn_shapes",
     "predictions",
@@ -37,6 +45,10 @@ __all__ = [
     "training_poses",
     "vertex_error_m",
 ]
+
+
+LEAST_TAUGHT = 2
+"""Good frames without which nothing can be learned."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -209,6 +221,39 @@ def training_poses(
     distances, _ = nearest_poses(quaternions(validation, None), first)
     validated = float(np.percentile(distances, 95)) if len(distances) else 0.0
     return PoseRange(np.concatenate([first, seen(late)]), layout.joints, validated)
+
+
+def examined(
+    clips: FittingClips,
+    layout: ControlLayout,
+    coefficients: CoefficientRange,
+    fit: Callable[[FittingClips], Regressor],
+) -> Trust:
+    """How far a regressor's answers can be believed, shown on each take by what was learned from the others; of an only
+    take, on its end.
+
+    Args:
+        fit: learns from clips, with settings that are chosen already.
+    """
+    takes = sorted({clip.take for clip in clips.all})
+    folds = [
+        ([clip for clip in clips.all if clip.take != take], [clip for clip in clips.all if clip.take == take])
+        for take in takes
+    ]
+    parts = folds if len(takes) > 1 else [(clips.training, clips.validation)]
+    distances, answers, truth = [], [], []
+    for known, asked in parts:
+        if sum(int(clip.good.sum()) for clip in known) < LEAST_TAUGHT:
+            continue
+        learned, reach = fit(FittingClips(known, (), known)), ControlRange.of(known, layout)
+        for clip in asked:
+            controls, _ = reach.bounded(clip.controls, layout, np.inf)
+            distances.append(reach.distances(clip.controls, layout)[clip.good])
+            answers.append(coefficients.inside(learned.predict(controls))[clip.good])
+            truth.append(clip.coefficients[clip.good])
+    if not distances:
+        return Trust.whole()
+    return Trust.of(np.concatenate(distances), np.concatenate(answers), np.concatenate(truth))
 
 
 def _learned_pieces(pieces: Sequence[Piece]) -> tuple[list[Piece], list[Piece]]:
