@@ -91,7 +91,7 @@ def _write_range(path: Path) -> None:
     poses = RNG.random((3, len(layout.pose_columns)), np.float32)
     controls = ControlRange(np.zeros(layout.size, np.float32), np.ones(len(layout.parts), np.float32), poses)
     coefficients = CoefficientRange(np.ones(SHAPES, np.float32), np.ones(SHAPES, np.float32), 2.0)
-    known = KnownRange(PoseRange(still, (1, 2), 5.0), {"linear": controls, "kernel": controls}, coefficients, 1.25)
+    known = KnownRange(PoseRange(still, (1, 2), 5.0), {"linear": controls, "kernel": controls}, coefficients)
     save_known_range(path, known, model_digest=DIGEST)
 
 

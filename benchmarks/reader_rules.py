@@ -314,7 +314,6 @@ RULES = (
         ("poses.safetensors", _tensor("linear.poses", lambda chance, array: array[:, 0])),
         ("poses.safetensors", _note("length", to=lambda chance, _: chance.choice((-1, True, "2", 1e999)))),
         ("poses.safetensors", _note("validated_deg", to=lambda chance, _: chance.choice((-1, True, "2")))),
-        ("poses.safetensors", _note("stretch_p99", to=lambda chance, _: chance.choice((-1, 0, "2")))),
         ("poses.safetensors", _note("joints", to=lambda chance, _: chance.choice(([1], [1, 1], [-1, 2])))),
         ("poses.safetensors", _note("controls", to=lambda chance, _: chance.choice((["kernel"], [], ["x"])))),
         ("parameters.npz", _arrays(transl=_of(np.zeros((2, 3))))),

@@ -2,7 +2,7 @@
 
 naive      the captured offsets skinned with the other person's skeleton
 eq5        the mean moved with the body (DeepWrinkles, Eq. 5, corrected)
-default    the same, its edges no longer than those of what was learned, and out of the body
+default    the same, out of the body, and its edges no longer than cloth's
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from data_synth.config import TrainingSetConfig
 from retarget.animation.animator import AnimatedFrame, Animator
 from retarget.animation.bodies import retargeted_mean
 from retarget.config import AnimateConfig, RemovalConfig, ShapeConfig
-from retarget.regression.learning import learn_shapes, learned_stretch
+from retarget.regression.learning import learn_shapes
 from retarget.shapes.blendshapes import ShapeSpace, as_model_arrays, project
 
 METHODS = ("naive", "eq5", "default")
@@ -45,10 +45,9 @@ def run(*, quick: bool = False, workers: int = 2, tracked: bool = True, every: i
     model = BlendshapeModel(
         taken.garment, *as_model_arrays(space), taken.person.body.joint_names, taken.takes.takes[0].poses.fps
     )
-    stretch = learned_stretch(taken.takes, taken.pieces, space, taken.garment.template.faces)
     metrics, ratios, inside, before, moved = [], [], [], [], []
     for who in config.bodies:
-        errors, removals = _on(who, taken, model, space, stretch, config, folder, every)
+        errors, removals = _on(who, taken, model, space, config, folder, every)
         metrics += [Metric(f"{who}_{method}_mm", errors[method], "mm") for method in METHODS]
         ratios.append(errors["default"] / errors["naive"])
         inside.append(float(np.mean([each.after.inside_percent for each in removals])))
@@ -69,7 +68,6 @@ def _on(
     taken: Lesson,
     model: BlendshapeModel,
     space: ShapeSpace,
-    stretch_p99: float,
     config: TrainingSetConfig,
     folder: Path,
     every: int,
@@ -88,7 +86,7 @@ def _on(
         coefficients = np.zeros((len(poses.frame_ids), captured.shape[1]), np.float32)
         coefficients[rows] = captured
         for method in METHODS:
-            animated = _animated(method, taken, model, person, poses, coefficients, stretch_p99, rows)
+            animated = _animated(method, taken, model, person, poses, coefficients, rows)
             errors[method] += [_error_mm(each.vertices, truth, row) for each, row in zip(animated, rows, strict=True)]
             if method == "default":
                 removals += [each.removed for each in animated]
@@ -102,7 +100,6 @@ def _animated(
     person: ShapedBody,
     poses: PoseSequence,
     coefficients: np.ndarray,
-    stretch_p99: float,
     rows: Sequence[int],
 ) -> list[AnimatedFrame]:
     whole = method == "default"
@@ -112,7 +109,7 @@ def _animated(
         removal=RemovalConfig(enabled=whole),
     )
     mean = retargeted_mean(model, taken.person, person, formula=settings.mean)
-    return Animator(model, person, mean, settings, stretch_p99=stretch_p99).frames(poses, coefficients, rows)
+    return Animator(model, person, mean, settings).frames(poses, coefficients, rows)
 
 
 def _error_mm(vertices: np.ndarray, truth: RegisteredSequence, row: int) -> float:

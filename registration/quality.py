@@ -19,11 +19,11 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.spatial import KDTree
 
+from capture4d.geometry.mesh import edge_lengths, edge_stretch, stretch_p99
 from capture4d.geometry.point_grid import PointGrid
 from capture4d.geometry.triangles import count_intersecting_faces, fan_distances
 from registration.config import QualityConfig
 from registration.correspondences import mesh_normals
-from registration.energies import edge_vectors
 from registration.register import FrameScan
 from registration.template import TemplateAnalysis
 
@@ -93,7 +93,7 @@ def assess(
     sideways = np.sqrt(np.maximum(distance**2 - height**2, 0.0))
     covered = sideways <= COVERED_SPACINGS * scan.surface.spacing
     residual = np.where(covered, height, np.nan)
-    stretch = np.linalg.norm(edge_vectors(vertices, analysis.edges), axis=1) / np.maximum(analysis.rest_lengths, 1e-12)
+    stretch = edge_stretch(vertices, analysis.edges, edge_lengths(analysis.rest, analysis.edges))
     against = (np.einsum("va,va->v", normals, scan_normals) < 0.0) & covered
     flipped = against[analysis.faces].all(axis=1)
     flipped_vertices = np.zeros(len(vertices), bool)
@@ -109,7 +109,7 @@ def assess(
         "scan_fit_p95_mm": _percentile(scan_fit, 95),
         "boundary_mean_mm": _mean(1e3 * border),
         "boundary_p95_mm": _percentile(1e3 * border, 95),
-        "stretch_p99": _percentile(stretch, 99),
+        "stretch_p99": stretch_p99(stretch),
         "flipped_faces": int(flipped.sum()),
         "self_intersections": count_intersecting_faces(vertices, analysis.faces),
         "covered_percent": 100.0 * float(covered.mean()),

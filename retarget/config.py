@@ -206,20 +206,18 @@ class FitConfig:
 
 @settings
 class RemovalConfig:
-    """Taking the garment out of the body."""
+    """Taking the garment out of the body, edges kept."""
 
     enabled: bool = True
-    """Take the garment out of the body."""
+    """Take the garment out of the body; off, edges alone keep to their lengths."""
     margin_mm: NonNegative = 2.0
     """How far outside the body its vertices are put."""
-    stay: Positive = 1.0
-    """Weight of staying in place, for the vertices that are outside (1 in TailorNet's code)."""
-    leave: Positive = 4.0
-    """Weight of reaching the outside, for those that are not (4 in TailorNet's code); each round doubles it."""
-    rounds: Whole = 6
-    """Searches for vertices inside; what is left is moved straight out."""
-    faces: bool = True
-    """Also where the body pokes through a face of the garment whose corners are all outside."""
+    rounds: Whole = 12
+    """Searches for where the limbs are; it ends sooner if nothing moves."""
+    sweeps: Count = 15
+    """Passes over all edges and vertices from one search to the next."""
+    spread: Share = 0.2
+    """Share of the way to its neighbours' mean displacement that a vertex goes in a pass, at first; none in the end."""
 
 
 @settings
@@ -231,9 +229,9 @@ class AnimateConfig:
     mean: Literal["corrected", "printed", "captured"] = "corrected"
     """How the mean meets another body: moved by the difference of the two bodies (Eq. 5, corrected), by the new body's
     whole offset from the average person (as printed), or not at all."""
-    longest: NonNegative = 1.2
-    """Edges are drawn together to this many times their length in the mean garment on the person, or as far as they
-    stretched in what was learned from, if that is more; 0: they stay as long as they come."""
+    longest: NonNegative = 1.15
+    """Edges are drawn together to this many times their length in the template on the person, or their length in the
+    mean garment, if that is more; 0: they stay as long as they come."""
     unlike_deg: NonNegative = 10.0
     """A pose farther than this from every training pose is reported, unless the model was validated farther away."""
     fps: Positive | None = None

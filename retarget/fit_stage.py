@@ -30,7 +30,7 @@ from capture4d.files.atomic import read_json, write_json
 from capture4d.files.records import save_body
 from capture4d.runs.stage import Stage, StageResult, open_stage, require_complete
 from capture4d.types import BlendshapeModel, Body, Garment
-from retarget.config import FitConfig
+from retarget.config import FitConfig, KernelConfig
 from retarget.fit_takes import RegisteredTake, read_takes, stack_takes, unpose_takes
 from retarget.model_folder import KERNEL, LINEAR, LSTM, MODEL, POSES, piece_name, shapes_digest
 from retarget.regression.controls import ControlLayout
@@ -40,9 +40,9 @@ from retarget.regression.known_range import CoefficientRange, ControlRange, Know
 from retarget.regression.learning import (
     Projected,
     UnposedTakes,
+    examined,
     fitting_clips,
     learn_shapes,
-    learned_stretch,
     predictions,
     regression_clips,
     training_poses,
@@ -57,7 +57,9 @@ from retarget.shapes.mirroring import Mirror, find_mirror
 
 __all__ = ["run"]
 
-SCHEMA = 5
+SCHEMA = 6
+EXAMINED_FRAMES = 1000
+"""Kernels that only show how far they can be trusted learn from no more; time grows with the cube."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -202,20 +204,24 @@ def _regressors(
     clips = fitting_clips(lesson.takes, lesson.pieces, layout, space, mirror, projected)
     linear = fit_linear(clips, layout, space.std, config.linear)
     save_linear(stage.path / LINEAR, linear, model_digest=digest)
-    ranges = {"linear": ControlRange.of(clips.all, layout)}
+    known_shapes = CoefficientRange.of(clips.all, space.std)
+    chosen = replace(config.linear, ridges=(linear.ridge,))
+    trust = examined(clips, layout, known_shapes, lambda known: fit_linear(known, layout, space.std, chosen))
+    ranges = {"linear": replace(ControlRange.of(clips.all, layout), trust=trust)}
     kernel = network = None
     if config.regressor != "linear":
         own = ControlLayout.create(lesson.body, lesson.takes.skin_weights, layout.fps, config.kernel.control)
         wider = fitting_clips(lesson.takes, lesson.pieces, own, space, mirror, projected)
-        ranges["kernel"] = ControlRange.of(wider.all, own)
         if not (stage.path / KERNEL).is_file():
             learned = fit_kernel(wider, own, space.std, config.kernel)
             save_kernel(stage.path / KERNEL, learned, model_digest=digest)
         kernel = load_kernel(stage.path / KERNEL, model_digest=digest)
+        plain = _untuned(config.kernel, kernel.ridge)
+        trust = examined(wider, own, known_shapes, lambda known: fit_kernel(known, own, space.std, plain))
+        ranges["kernel"] = replace(ControlRange.of(wider.all, own), trust=trust)
     if config.regressor == "all":
         network = _network(stage, clips, linear, space, config, device)
-    stretch = learned_stretch(lesson.takes, lesson.pieces, space, lesson.garment.template.faces)
-    known = KnownRange(poses, ranges, CoefficientRange.of(clips.all, space.std), stretch)
+    known = KnownRange(poses, ranges, known_shapes)
     save_known_range(stage.path / POSES, known, model_digest=digest)
     note: dict[str, Any] = {
         "mirrored": mirror is not None,
@@ -226,7 +232,15 @@ def _regressors(
     for name, regressor in regressors_by_name(known, linear, network, kernel).items():
         note[name] = {"ridge": ridges[name]} if name in ridges else {}
         note[name] |= _errors(lesson, regressor, space, projected)
+        if name in ranges:
+            note[name]["trust"] = [{"degrees": degrees, "share": share} for degrees, share in ranges[name].trust.knots]
     return note
+
+
+def _untuned(config: KernelConfig, ridge: float) -> KernelConfig:
+    """What the kernels are examined with, once for every take: a smaller problem, and no better."""
+    tuning = replace(config.tuning, enabled=False)
+    return replace(config, ridges=(ridge,), tuning=tuning, most_frames=min(config.most_frames, EXAMINED_FRAMES))
 
 
 def _errors(lesson: _Lesson, regressor: Regressor, space: ShapeSpace, projected: Projected) -> dict[str, Any]:

@@ -7,7 +7,7 @@ integer vertex indices, counter-clockwise seen from outside.
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float, Int32, Int64, Integer
+from jaxtyping import Bool, Float, Float64, Int32, Int64, Integer
 from scipy import sparse
 from scipy.sparse import csgraph
 
@@ -18,11 +18,14 @@ __all__ = [
     "boundary_loops",
     "connected_components",
     "doubled_area_vectors",
+    "edge_lengths",
+    "edge_stretch",
     "edge_uses",
     "edges_of_faces",
     "face_areas",
     "half_edges",
     "normalised",
+    "stretch_p99",
     "submesh",
     "unique_edges",
     "vertex_adjacency",
@@ -83,6 +86,28 @@ def edge_uses(faces: Integer[np.ndarray, "F 3"]) -> tuple[Int32[np.ndarray, "E 2
     """Undirected edges, as `unique_edges` has them, and how many faces each belongs to."""
     keys, uses = np.unique(_edge_keys(half_edges(faces)), return_counts=True)
     return _edges_of_keys(keys), uses
+
+
+def edge_lengths(vertices: Float[np.ndarray, "V 3"], edges: Integer[np.ndarray, "E 2"]) -> Float[np.ndarray, " E"]:
+    """In the vertices' unit."""
+    return np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
+
+
+def edge_stretch(
+    vertices: Float[np.ndarray, "V 3"], edges: Integer[np.ndarray, "E 2"], template_lengths: Float[np.ndarray, " E"]
+) -> Float64[np.ndarray, " E"]:
+    """How long each edge is, over its length in the template.
+
+    Args:
+        template_lengths: those of the template graded to the person who wears it.
+    """
+    return edge_lengths(vertices.astype(np.float64), edges) / np.maximum(template_lengths, 1e-12)
+
+
+def stretch_p99(stretch: Float[np.ndarray, " E"]) -> float:
+    """A frame's stretch, wherever one is told: the 99th percentile over its edges of `edge_stretch`; NaN without
+    edges."""
+    return float(np.percentile(stretch, 99)) if len(stretch) else float("nan")
 
 
 def edges_of_faces(faces: Integer[np.ndarray, "F 3"], edges: Integer[np.ndarray, "E 2"]) -> Int64[np.ndarray, "F 3"]:

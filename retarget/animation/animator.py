@@ -11,11 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64
 
+from capture4d.body.binding import with_body_shape
+from capture4d.body.limbs import WornBody
 from capture4d.body.skinning import ShapedBody, pose_frame
-from capture4d.geometry.intersection_removal import ClosedSurface, IntersectionRemoval, Removed
-from capture4d.geometry.mesh import unique_edges
+from capture4d.geometry.intersection_removal import IntersectionRemoval, Removed
+from capture4d.geometry.mesh import edge_lengths, edge_stretch, stretch_p99, unique_edges
 from capture4d.types import BlendshapeModel, PoseSequence
-from retarget.animation.strain import StrainLimit
 from retarget.config import AnimateConfig
 from retarget.shapes.blendshapes import reconstruct, skin_frames
 
@@ -33,7 +34,7 @@ class AnimatedFrame:
     """Metres, world."""
     removed: Removed
     stretch_p99: float
-    """Edge length over the mean garment's on this person, 99th percentile."""
+    """Edge length over the template's on this person, 99th percentile."""
 
 
 class Animator:
@@ -41,7 +42,6 @@ class Animator:
 
     Args:
         mean: the garment's mean in that person's rest pose, metres.
-        stretch_p99: how far its edges stretched in what it was learned from, `KnownRange.stretch_p99`.
     """
 
     def __init__(
@@ -50,21 +50,19 @@ class Animator:
         person: ShapedBody,
         mean: Float64[np.ndarray, "verts 3"],
         config: AnimateConfig,
-        *,
-        stretch_p99: float = 1.0,
     ) -> None:
-        assert model.garment.skin_weights is not None
-        self._basis, self._weights = model.basis, model.garment.skin_weights
+        garment = with_body_shape(model.garment, person.body, np.asarray(person.shape, np.float32))
+        assert garment.skin_weights is not None
+        self._basis, self._weights = model.basis, garment.skin_weights
         self._person, self._mean = person, mean.astype(np.float32)
-        faces = model.garment.template.faces
+        faces = garment.template.faces
         self._edges = unique_edges(faces)
-        self._lengths = self._edge_lengths(mean)
-        self._removal = IntersectionRemoval(faces, len(mean), config.removal)
-        longest = max(config.longest, stretch_p99) if config.longest else np.inf
-        self._limit = StrainLimit(self._edges, self._lengths, len(mean), longest)
-
-    def _edge_lengths(self, vertices: np.ndarray) -> np.ndarray:
-        return np.linalg.norm(vertices[self._edges[:, 0]] - vertices[self._edges[:, 1]], axis=1)
+        self._lengths = edge_lengths(garment.template.vertices.astype(np.float64), self._edges)
+        # a garment that is tight on the captured person is not drawn into its wearer
+        worn = edge_stretch(mean, self._edges, self._lengths)
+        longest = np.maximum(config.longest, worn) if config.longest else np.inf
+        self._removal = IntersectionRemoval(faces, len(mean), self._lengths, longest, config.removal)
+        self._worn = WornBody(person, mean, self._weights)
 
     def frames(
         self, poses: PoseSequence, coefficients: Float32[np.ndarray, "frames shapes"], rows: Sequence[int]
@@ -73,11 +71,9 @@ class Animator:
         posed = [pose_frame(self._person, poses, row) for row in rows]
         rest = reconstruct(self._mean, self._basis, coefficients[list(rows)])
         placed = skin_frames(rest, self._weights, np.stack([each.transforms for each in posed]))
-        faces = self._person.body.template.faces
         found = []
         for vertices, body in zip(placed, posed, strict=True):
-            surface = ClosedSurface(body.vertices(), faces)
-            removed = self._removal(self._limit(vertices), surface)
-            stretch = self._edge_lengths(removed.vertices) / np.maximum(self._lengths, 1e-9)
-            found.append(AnimatedFrame(removed.vertices.astype(np.float32), removed, float(np.percentile(stretch, 99))))
+            removed = self._removal(vertices, self._worn.posed(body.vertices()))
+            stretch = stretch_p99(edge_stretch(removed.vertices, self._edges, self._lengths))
+            found.append(AnimatedFrame(removed.vertices.astype(np.float32), removed, stretch))
         return found

@@ -101,7 +101,7 @@ class GarmentModel:
         config = AnimateConfig(removal=RemovalConfig(enabled=remove_intersections))
         motion = replace(pose, shape=np.asarray(person.shape, np.float32))
         mean = retargeted_mean(self.model, captured_person(self.model, self.body), person, formula=config.mean)
-        animator = Animator(self.model, person, mean, config, stretch_p99=self.limits.stretch_p99)
+        animator = Animator(self.model, person, mean, config)
         coefficients = regressor.predict(control_vectors(regressor.layout, motion))
         count = len(motion.frame_ids)
         chunks = [range(start, min(start + FRAMES_AT_ONCE, count)) for start in range(0, count, FRAMES_AT_ONCE)]

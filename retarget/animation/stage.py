@@ -39,12 +39,15 @@ from retarget.regression.controls import control_vectors
 
 __all__ = ["Wearer", "run", "run_on_coefficients"]
 
-SCHEMA = 1
+SCHEMA = 2
 INSIDE_CHECK_PERCENT = 0.3
 """A frame with more of its vertices inside the body, after all, is flagged."""
 STRETCH_CHECK, STRETCH_FAIL = 1.4, 2.5
-"""A frame with edges so much longer than the mean garment's, 99th percentile, is flagged, or has failed: cloth does not
+"""A frame with edges so much longer than the template's, 99th percentile, is flagged, or has failed: cloth does not
 stretch like that. The limits are registration's (`quality.stretch_check`, `quality.stretch_fail`)."""
+FLIPPED_CHECK_PERCENT = 1.0
+"""A frame with more of its faces turned against the body is flagged (registration's `quality.flipped_check_percent`,
+which goes by the scan)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -272,8 +275,7 @@ def _animate(
     unlike = max(config.unlike_deg, known.limits.poses.validated_deg)
     shared = _Motion(stage, motion, coefficients, known.limits.poses.distances(motion), unlike)
     write = partial(_write_frames, shared)
-    stretch = known.limits.stretch_p99
-    prepare = partial(Animator, known.model, scene.person, scene.mean, config, stretch_p99=stretch)
+    prepare = partial(Animator, known.model, scene.person, scene.mean, config)
     for _ in run_jobs(write, chunks, prepare=prepare, workers=workers, label="animate", units=len):
         pass
     return _collect(stage, frame_ids)
@@ -287,16 +289,19 @@ def _write_frames(shared: _Motion, animator: Animator, rows: Sequence[int]) -> N
 def _write_frame(shared: _Motion, row: int, frame: AnimatedFrame) -> None:
     """Metrics first: the frame counts as done once its npz is there."""
     stage, removed = shared.stage, frame.removed
+    flipped_percent = 100.0 * float(removed.flipped.mean()) if len(removed.flipped) else 0.0
     frame_id, distance_deg = int(shared.poses.frame_ids[row]), float(shared.distances_deg[row])
     reasons = []
     torn = not frame.stretch_p99 <= STRETCH_FAIL
     if not frame.stretch_p99 <= STRETCH_CHECK:
         limit = STRETCH_FAIL if torn else STRETCH_CHECK
-        reasons.append(f"edges {frame.stretch_p99:.3g} times as long as the mean garment's > {limit:g}")
+        reasons.append(f"edges {frame.stretch_p99:.3g} times as long as the template's > {limit:g}")
     if distance_deg > shared.unlike_deg:
         reasons.append(f"pose {distance_deg:.0f} deg from every pose that was learned > {shared.unlike_deg:.0f}")
     if removed.after.inside_percent > INSIDE_CHECK_PERCENT:
         reasons.append(f"inside the body {removed.after.inside_percent:.2f} % > {INSIDE_CHECK_PERCENT:g} %")
+    if flipped_percent > FLIPPED_CHECK_PERCENT:
+        reasons.append(f"faces turned against the body {flipped_percent:.2f} % > {FLIPPED_CHECK_PERCENT:g} %")
     record: dict[str, Any] = {
         "frame_id": frame_id,
         "verdict": "failed" if torn else "check" if reasons else "good",
@@ -307,8 +312,10 @@ def _write_frame(shared: _Motion, row: int, frame: AnimatedFrame) -> None:
         "depth_before_mm": removed.before.depth_max_mm,
         "inside_body_percent": removed.after.inside_percent,
         "depth_mm": removed.after.depth_max_mm,
+        "overlap_percent": removed.after.overlap_percent,
         "removal_moved_mm": removed.rest_moved_mm,
         "stretch_p99": frame.stretch_p99,
+        "flipped_faces": int(removed.flipped.sum()),
     }
     write_json(stage.frame_path(frame_id, ".json", folder="metrics"), record)
     write_npz(

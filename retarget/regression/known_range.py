@@ -1,8 +1,9 @@
 """What a garment was learned from, and answers that stay within it.
 
-A regressor is believed where it was taught. The distance of two poses is the root mean square, over the garment's
-joints, of the angle between their rotations. Farther from every learned pose than is known to be safe, the regressor is
-asked about the nearest point that is safe, and its answer fades towards the mean garment. How the root moves and how
+A regressor is believed where it was taught, as far as takes that were left out have shown it right. The distance of two
+poses is the root mean square, over the garment's joints, of the angle between their rotations. Farther from every
+learned pose than is known to be safe, the regressor is asked about the nearest point that is safe, and its answer fades
+towards the mean garment. How the root moves and how
 the joints turn is judged part by part: beyond what was learned, a part fades towards its mean, so that what is left is
 what the pose alone can say. Coefficients stay within those of the learned frames.
 
@@ -13,7 +14,7 @@ References: DeepWrinkles (ECCV 2018), section 5.3: retargeting works best near t
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,7 @@ __all__ = [
     "ControlRange",
     "KnownRange",
     "PoseRange",
+    "Trust",
     "load_known_range",
     "nearest_poses",
     "pose_quaternions",
@@ -57,6 +59,10 @@ NEAREST_SHARE = 0.15
 then moves without jumps."""
 NUMBERS_OF_A_RADIAN = np.sqrt(4 / 3)
 """Length, on average over axes, of the change of two columns of a rotation matrix, for each radian of a small turn."""
+TRUST_FRAMES, MOST_KNOTS = 12, 12
+"""Frames at like distances from which a share of trust is told, at least; and how often, at most."""
+HALF_RIGHT = 0.5
+"""A share of trust down to which a distance counts as safe."""
 LEAST_MOTION = {"velocity": 0.1, "acceleration": 1.0, "turning": 0.5}
 """Motion that is always taken for known: m/s, m/s^2, rad/s; a hand's breadth at arm's length."""
 
@@ -106,6 +112,54 @@ def nearest_poses(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Trust:
+    """What share of its answers a regressor is believed, by how far a pose is from every learned one."""
+
+    knots: Float32[np.ndarray, "knots 2"]
+    """Degrees, ascending, and shares from 1 to 0, not ascending; between them it is linear, beyond them level."""
+
+    @staticmethod
+    def whole() -> Trust:
+        """Of a regressor that was never examined."""
+        return Trust(np.array([[0.0, 1.0]], np.float32))
+
+    @staticmethod
+    def of(
+        distances_deg: Float64[np.ndarray, " frames"],
+        answers: Float[np.ndarray, "frames shapes"],
+        truth: Float[np.ndarray, "frames shapes"],
+    ) -> Trust:
+        """As frames that were not learned from show it: the share with which answers come nearest to the truth.
+
+        Frames at like distances are told together, by least squares; shares that would rise with the distance are
+        levelled (isotonic regression).
+        """
+        count = min(len(distances_deg) // TRUST_FRAMES, MOST_KNOTS)
+        if not count:
+            return Trust.whole()
+        levels: list[list[float]] = []  # degrees, <answer, truth> and <answer, answer> of neighbouring groups
+        groups: list[float] = []
+        for rows in np.array_split(np.argsort(distances_deg, kind="stable"), count):
+            said, true = answers[rows].astype(np.float64), truth[rows].astype(np.float64)
+            groups.append(float(distances_deg[rows].mean()))
+            levels.append([1, float((said * true).sum()), float((said**2).sum()) + 1e-12])
+            while len(levels) > 1 and levels[-1][1] / levels[-1][2] > levels[-2][1] / levels[-2][2]:
+                last = levels.pop()
+                levels[-1] = [a + b for a, b in zip(levels[-1], last, strict=True)]
+        shares = [np.clip(level[1] / level[2], 0, 1) for level in levels for _ in range(int(level[0]))]
+        return Trust(np.column_stack([groups, shares]).astype(np.float32))
+
+    def at(self, degrees: Float64[np.ndarray, " frames"]) -> Float64[np.ndarray, " frames"]:
+        return np.interp(degrees, self.knots[:, 0], self.knots[:, 1])
+
+    @property
+    def reach_deg(self) -> float:
+        """The farthest distance at which answers were at least half right; 0 if there is none."""
+        right = self.knots[self.knots[:, 1] >= HALF_RIGHT, 0]
+        return float(right.max(initial=0.0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class ControlRange:
     """The controls of one layout that were learned from."""
 
@@ -114,6 +168,8 @@ class ControlRange:
     """For each part of the layout, the largest distance of a learned frame from the mean; poses have none, 0."""
     poses: Float32[np.ndarray, "learned poses"]
     """What of the controls of some learned frames is their pose."""
+    trust: Trust = field(default_factory=Trust.whole)
+    """In the regressor that they drive."""
 
     @staticmethod
     def of(clips: Sequence[Clip], layout: ControlLayout) -> ControlRange:
@@ -152,7 +208,14 @@ class ControlRange:
         apart = _degrees(offset[:, turned])
         inward = np.minimum(1.0, safe_deg / np.maximum(apart, 1e-9))
         found[:, columns] = anchors + inward[:, None] * offset
-        return found.astype(np.float32), _fading(distances / safe_deg, FADED_POSES)
+        return found.astype(np.float32), self.trust.at(distances) * _fading(distances / safe_deg, FADED_POSES)
+
+    def distances(
+        self, controls: Float[np.ndarray, "frames controls"], layout: ControlLayout
+    ) -> Float64[np.ndarray, " frames"]:
+        """Degrees to the nearest learned pose."""
+        columns, turned = layout.pose_columns, slice(0, 6 * len(layout.joints))
+        return _nearest_points(controls[:, columns].astype(np.float64), self.poses.astype(np.float64), turned)[1]
 
 
 def _fading(times: Float[np.ndarray, " frames"], gone: float) -> Float64[np.ndarray, " frames"]:
@@ -274,13 +337,12 @@ class KnownRange:
     controls: Mapping[str, ControlRange]
     """By the regressor that they drive; the network's are those of the linear regression."""
     coefficients: CoefficientRange
-    stretch_p99: float
-    """Edge length over the mean garment's, 99th percentile, of the learned frame in which it is largest."""
 
-    @property
-    def safe_deg(self) -> float:
-        """How far from every learned pose a regressor is believed."""
-        return min(max(SAFE_DEG[0], self.poses.validated_deg), SAFE_DEG[1])
+    def safe_deg(self, name: str) -> float:
+        """How far from every learned pose a regressor's answers do not fade yet: as far as it was right where it was
+        examined."""
+        examined = max(self.poses.validated_deg, self.controls[name].trust.reach_deg)
+        return min(max(SAFE_DEG[0], examined), SAFE_DEG[1])
 
     def require(self, name: str, layout: ControlLayout, shapes: int) -> None:
         """Raise InputError unless it belongs to such a regressor."""
@@ -298,8 +360,8 @@ class KnownRange:
 
     def bounded(self, name: str, regressor: Regressor) -> BoundedRegressor:
         """A regressor of that name within what is known."""
-        controls = self.controls["kernel" if name == "kernel" else "linear"]
-        return BoundedRegressor(regressor, controls, self.coefficients, self.safe_deg)
+        driven = "kernel" if name == "kernel" else "linear"
+        return BoundedRegressor(regressor, self.controls[driven], self.coefficients, self.safe_deg(driven))
 
 
 # --- files -------------------------------------------------------------------------------------------------------
@@ -310,11 +372,11 @@ def save_known_range(path: Path, known: KnownRange, *, model_digest: str) -> Non
     tensors = {"quaternions": poses.quaternions, "std": coefficients.std, "largest": coefficients.largest}
     for name, controls in known.controls.items():
         tensors |= {f"{name}.{part}": getattr(controls, part) for part in ("mean", "largest", "poses")}
+        tensors[f"{name}.trust"] = controls.trust.knots
     note = {
         "joints": list(poses.joints),
         "validated_deg": poses.validated_deg,
         "length": coefficients.length,
-        "stretch_p99": known.stretch_p99,
         "controls": sorted(known.controls),
         "model": model_digest,
     }
@@ -343,25 +405,33 @@ def load_known_range(path: Path, *, model_digest: str) -> KnownRange:
             PoseRange(quaternions, joints, _amount(file, "validated_deg")),
             {name: _control_range(file, name) for name in names},
             _coefficient_range(file),
-            _amount(file, "stretch_p99", above=True),
         )
 
 
-def _amount(file: TensorFile, name: str, *, above: bool = False) -> float:
-    """A number of the note, not below 0; or above it."""
+def _amount(file: TensorFile, name: str) -> float:
+    """A number of the note, not below 0."""
     found = number(file.entry(name), name)
-    if found < 0 or (above and found == 0):
-        raise InputError(f"expected {name} {'above' if above else 'from'} 0, found {found:g}")
+    if found < 0:
+        raise InputError(f"expected {name} from 0, found {found:g}")
     return found
 
 
 def _control_range(file: TensorFile, name: str) -> ControlRange:
-    found = ControlRange(file[f"{name}.mean"], file[f"{name}.largest"], file[f"{name}.poses"])
+    found = ControlRange(
+        file[f"{name}.mean"], file[f"{name}.largest"], file[f"{name}.poses"], Trust(file[f"{name}.trust"])
+    )
     for each, axes in ((found.mean, 1), (found.largest, 1), (found.poses, 2)):
         if each.ndim != axes or each.dtype != np.float32 or not np.isfinite(each).all():
             raise InputError(f"{name}: expected finite float32 controls, found {each.dtype} of {each.shape}, or NaN")
     if found.largest.min(initial=0) < 0:
         raise InputError(f"{name}: expected distances from 0, found {found.largest.min():g}")
+    knots = found.trust.knots
+    if knots.ndim != 2 or knots.shape[1] != 2 or not len(knots) or knots.dtype != np.float32:
+        raise InputError(f"{name}: expected knots of trust in two columns of float32, found {knots.shape}")
+    ascending, falling = (np.diff(knots[:, 0]) >= 0).all(), (np.diff(knots[:, 1]) <= 0).all()
+    within = knots[:, 0].min() >= 0 and knots[:, 1].min() >= 0 and knots[:, 1].max() <= 1
+    if not (np.isfinite(knots).all() and ascending and falling and within):
+        raise InputError(f"{name}: expected trust that falls from 1 to 0 with the distance, found another")
     return found
 
 

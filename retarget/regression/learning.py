@@ -5,17 +5,23 @@ The arrays of all takes lie one after the other; a `Take` says where its frames 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int64
 
-from capture4d.geometry.mesh import unique_edges
 from capture4d.types import PoseSequence
 from retarget.config import ShapeConfig
 from retarget.regression.controls import ControlLayout, control_vectors
-from retarget.regression.known_range import PoseRange, nearest_poses, pose_quaternions
+from retarget.regression.known_range import (
+    CoefficientRange,
+    ControlRange,
+    PoseRange,
+    Trust,
+    nearest_poses,
+    pose_quaternions,
+)
 from retarget.regression.regressors import Clip, FittingClips, Regressor
 from retarget.regression.splits import Piece, Role
 from retarget.shapes.blendshapes import (
@@ -24,7 +30,6 @@ from retarget.shapes.blendshapes import (
     learn_shape_space,
     posed_errors,
     project,
-    skin_frames,
 )
 from retarget.shapes.mirroring import Mirror
 
@@ -32,9 +37,9 @@ __all__ = [
     "Projected",
     "Take",
     "UnposedTakes",
+    "examined",
     "fitting_clips",
     "learn_shapes",
-    "learned_stretch",
     "predictions",
     "regression_clips",
     "training_poses",
@@ -42,8 +47,8 @@ __all__ = [
 ]
 
 
-STRETCH_FRAMES = 100
-"""Of the learned frames, evenly spread, that are looked at for how far cloth stretches."""
+LEAST_TAUGHT = 2
+"""Good frames without which nothing can be learned."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -193,20 +198,6 @@ def vertex_error_m(
     return total / max(count, 1)
 
 
-def learned_stretch(
-    takes: UnposedTakes, pieces: Sequence[Piece], space: ShapeSpace, faces: Int32[np.ndarray, "faces 3"]
-) -> float:
-    """How far edges stretch in what is learned from: their length in the pose over the mean garment's, 99th percentile
-    of the frame in which that is largest, of some frames."""
-    rows = takes.rows(pieces, "training")
-    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), STRETCH_FRAMES)).round().astype(int)]
-    edges = unique_edges(faces)
-    usual = np.maximum(np.linalg.norm(space.mean[edges[:, 0]] - space.mean[edges[:, 1]], axis=1), 1e-9)
-    placed = skin_frames(takes.vertices[rows], takes.skin_weights, takes.transforms[rows])
-    lengths = np.linalg.norm(placed[:, edges[:, 0]] - placed[:, edges[:, 1]], axis=2)
-    return float(np.percentile(lengths / usual, 99, axis=1).max())
-
-
 def training_poses(
     takes: UnposedTakes, pieces: Sequence[Piece], layout: ControlLayout, mirror: Mirror | None = None
 ) -> PoseRange:
@@ -230,6 +221,39 @@ def training_poses(
     distances, _ = nearest_poses(quaternions(validation, None), first)
     validated = float(np.percentile(distances, 95)) if len(distances) else 0.0
     return PoseRange(np.concatenate([first, seen(late)]), layout.joints, validated)
+
+
+def examined(
+    clips: FittingClips,
+    layout: ControlLayout,
+    coefficients: CoefficientRange,
+    fit: Callable[[FittingClips], Regressor],
+) -> Trust:
+    """How far a regressor's answers can be believed, shown on each take by what was learned from the others; of an only
+    take, on its end.
+
+    Args:
+        fit: learns from clips, with settings that are chosen already.
+    """
+    takes = sorted({clip.take for clip in clips.all})
+    folds = [
+        ([clip for clip in clips.all if clip.take != take], [clip for clip in clips.all if clip.take == take])
+        for take in takes
+    ]
+    parts = folds if len(takes) > 1 else [(clips.training, clips.validation)]
+    distances, answers, truth = [], [], []
+    for known, asked in parts:
+        if sum(int(clip.good.sum()) for clip in known) < LEAST_TAUGHT:
+            continue
+        learned, reach = fit(FittingClips(known, (), known)), ControlRange.of(known, layout)
+        for clip in asked:
+            controls, _ = reach.bounded(clip.controls, layout, np.inf)
+            distances.append(reach.distances(clip.controls, layout)[clip.good])
+            answers.append(coefficients.inside(learned.predict(controls))[clip.good])
+            truth.append(clip.coefficients[clip.good])
+    if not distances:
+        return Trust.whole()
+    return Trust.of(np.concatenate(distances), np.concatenate(answers), np.concatenate(truth))
 
 
 def _learned_pieces(pieces: Sequence[Piece]) -> tuple[list[Piece], list[Piece]]:

@@ -71,8 +71,8 @@ class Modelled:
                 shape[:] = 0
                 shape[: len(first)] = first[: len(shape)]
             person = with_shape(body, shape)
-            mean, stretch = retargeted_mean(model, captured, person), self.known.limits.stretch_p99
-            animator = Animator(model, person, mean, AnimateConfig(), stretch_p99=stretch)
+            mean = retargeted_mean(model, captured, person)
+            animator = Animator(model, person, mean, AnimateConfig())
             (frame,) = animator.frames(self.poses, self.coefficients, [row])
             posed = pose_frame(person, self.poses, row).vertices().astype(np.float32)
             garment = model.garment.template.with_vertices(frame.vertices)

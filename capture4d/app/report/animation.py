@@ -35,6 +35,7 @@ PICTURES = 8
 ANIMATION_METRICS: Mapping[str, tuple[str, str, str]] = {
     "frames_good_percent": ("%", "higher", "frames with the verdict good"),
     "frames_check": ("", "lower", "frames with the verdict check"),
+    "frames_failed": ("", "lower", "frames with the verdict failed"),
     "pose_distance_deg": ("deg", "lower", "to the nearest pose that the garment was learned from"),
     "unlike_percent": ("%", "lower", "frames whose pose is unlike any that was learned"),
     "inside_before_percent": ("%", "lower", "garment vertices inside the body before they were taken out"),
@@ -42,7 +43,10 @@ ANIMATION_METRICS: Mapping[str, tuple[str, str, str]] = {
     "inside_body_percent": ("%", "lower", "garment vertices inside the body"),
     "depth_mm": ("mm", "lower", "the deepest of a frame"),
     "removal_moved_mm": ("mm", "lower", "how far taking them out has moved the others, mean"),
-    "stretch_p99": ("", "lower", "edge length over the mean garment's on this person, 99th percentile of a frame"),
+    "overlap_percent": ("%", "lower", "garment vertices over skin that is inside another limb"),
+    "stretch_p99": ("", "lower", "edge length over the template's on this person, 99th percentile of a frame"),
+    "stretch_p99_worst": ("", "lower", "the same of the worst frame"),
+    "flipped_faces": ("", "lower", "faces turned against the body, per frame"),
 }
 """Unit, better direction and meaning. Unless it says otherwise, it is the mean over the frames."""
 
@@ -81,11 +85,13 @@ def run(work: WorkFolder, *, workers: int = 1, overwrite: bool = False) -> Stage
 
 def summarise(records: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     """The metrics from the frames' records."""
-    good = sum(record["verdict"] == "good" for record in records)
+    count = {verdict: sum(record["verdict"] == verdict for record in records) for verdict in VERDICTS}
     unlike = column(records, "pose_distance_deg") > column(records, "unlike_deg")
     special = {
-        "frames_good_percent": 100 * good / len(records),
-        "frames_check": float(len(records) - good),
+        "frames_good_percent": 100 * count["good"] / len(records),
+        "frames_check": float(count["check"]),
+        "frames_failed": float(count["failed"]),
+        "stretch_p99_worst": float(np.max(column(records, "stretch_p99"))),
         "unlike_percent": 100 * float(unlike.mean()),
     }
     return {key: special.get(key, float(np.mean(column(records, key)))) for key in ANIMATION_METRICS
@@ -130,7 +136,8 @@ def _page(
                 ("frames_good_percent", "frames are good"),
                 ("inside_before_percent", "was inside the body"),
                 ("inside_body_percent", "is inside the body"),
-                ("removal_moved_mm", "taking it out moved the rest"),
+                ("stretch_p99_worst", "stretch of the worst frame"),
+                ("flipped_faces", "faces turned against the body, per frame"),
                 ("pose_distance_deg", "to the nearest learned pose"),
             )
         ],

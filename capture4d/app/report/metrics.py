@@ -34,6 +34,7 @@ METRICS: Mapping[str, tuple[str, str, str]] = {
     "boundary_p95_mm": ("mm", "lower", "the same, 95th percentile of a frame"),
     "covered_percent": ("%", "higher", "template vertices with scan data"),
     "stretch_p99": ("", "lower", "edge length over the template's, 99th percentile of a frame"),
+    "stretch_p99_worst": ("", "lower", "the same of the worst frame"),
     "flipped_faces": ("", "lower", "faces against the scan they lie on, per frame"),
     "self_intersections": ("", "lower", "faces that cut another, per frame"),
     "frames_good_percent": ("%", "higher", "frames with the verdict good"),
@@ -68,6 +69,9 @@ def summarise(records: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
         "frames_failed": float(count["failed"]),
         "cpu_s": float(np.nanmedian(column(records, "cpu_s"))),
     }
+    stretch = column(records, "stretch_p99")
+    if np.isfinite(stretch).any():
+        special["stretch_p99_worst"] = float(np.nanmax(stretch))
     summary: dict[str, float | None] = {}
     correspondence = column(records, "correspondence_mean_mm")
     measured = np.flatnonzero(np.isfinite(correspondence))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -68,6 +69,7 @@ class Animate(GradedOptions):
 
     def __call__(self) -> int:
         from capture4d import pipeline
+        from capture4d.captures.work_folder import load_records
         from retarget.animation.stage import Wearer
 
         result = pipeline.animate(
@@ -82,4 +84,8 @@ class Animate(GradedOptions):
         )
         say_verdict(result.path, "animate")
         print(f"registration: {result.path}")
+        doubtful = [record for record in load_records(result.path) if record["verdict"] == "check"]
+        if doubtful:
+            first = f"frame {doubtful[0]['frame_id']}: {'; '.join(doubtful[0]['reasons'])}"
+            print(f"capture4d: {len(doubtful)} of {result.frames} frames are to be checked; {first}", file=sys.stderr)
         return self.graded(result)

@@ -10,7 +10,7 @@ from capture4d.body.skinning import pose_frame
 from capture4d.captures.work_folder import load_registration, open_work
 from capture4d.errors import InputError
 from capture4d.files.records import save_poses
-from capture4d.geometry.intersection_removal import ClosedSurface
+from capture4d.geometry.ray_casting import TriangleScene
 from capture4d.types import PoseSequence
 from retarget.animation.garment_model import GarmentModel, load_garment_model
 from retarget.animation.stage import Wearer, run
@@ -58,8 +58,9 @@ def test_somebody_else_wears_it_outside_the_body(garment_model: GarmentModel, po
     def inside(vertices: np.ndarray) -> int:
         count = 0
         for row, placed in enumerate(vertices):
-            surface = ClosedSurface(pose_frame(person, poses, row).vertices(), person.body.template.faces)
-            count += int((surface.heights(placed)[0] < -1e-4).sum())
+            body = pose_frame(person, poses, row).vertices()
+            nearest = TriangleScene((body, person.body.template.faces)).nearest(placed)
+            count += int((((placed - nearest.points) * nearest.normals).sum(axis=1) < -2e-4).sum())
         return count
 
     slim = garment_model.vertices(poses, remove_intersections=False)  # as it was captured, on too thick a limb

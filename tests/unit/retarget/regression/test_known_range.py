@@ -20,6 +20,7 @@ from retarget.regression.known_range import (
     ControlRange,
     KnownRange,
     PoseRange,
+    Trust,
     load_known_range,
     pose_quaternions,
     save_known_range,
@@ -155,12 +156,42 @@ def test_frames_one_by_one_are_the_motion_at_once(bounded, layout, motion) -> No
     np.testing.assert_allclose([stream.push(row) for row in controls], bounded.predict(controls), atol=1e-6)
 
 
+def test_trust_is_the_share_that_comes_nearest_and_never_rises() -> None:
+    """Right up to 10 degrees, half right at 20, of no use from 30; a lucky group farther out does not count."""
+    rng = np.random.default_rng(0)
+    truth = rng.standard_normal((400, 3))
+    distances = np.repeat([5.0, 20.0, 30.0, 40.0], 100)
+    wanted = np.repeat([1.0, 0.5, -0.4, 0.6], 100)
+    answers = truth / np.where(wanted == 0.5, 0.5, 1.0)[:, None] * np.where(wanted == -0.4, -1, 1)[:, None]
+    trust = Trust.of(distances, answers, truth)
+    np.testing.assert_allclose(trust.at(np.array([0.0, 5.0, 20.0])), [1, 1, 0.5], atol=0.05)
+    assert (np.diff(trust.at(np.linspace(0, 60, 100))) <= 1e-9).all()
+    assert trust.at(np.array([60.0]))[0] == trust.at(np.array([40.0]))[0] < 0.3
+    assert trust.reach_deg == pytest.approx(20.0)
+    shuffled = rng.permutation(400)
+    again = Trust.of(distances[shuffled], answers[shuffled], truth[shuffled])
+    np.testing.assert_allclose(again.knots, trust.knots, atol=0.1)
+    assert Trust.of(distances[:5], answers[:5], truth[:5]).at(np.array([50.0]))[0] == 1
+
+
+def test_answers_are_believed_by_the_share_that_was_shown(bounded, layout, motion) -> None:
+    controls = control_vectors(layout, turned(motion(20, 4), 8.0))
+    half = Trust(np.array([[0, 0.5]], np.float32))
+    doubtful = replace(bounded, controls=replace(bounded.controls, trust=half))
+    safe, _ = bounded.controls.bounded(controls, layout, bounded.safe_deg)
+    raw, whole = 2 * safe[:, :3], bounded.predict(controls)
+    inside = np.abs(raw) < 0.9 * bounded.coefficients.largest
+    near = inside.all(axis=1) & (np.linalg.norm(raw / bounded.coefficients.std, axis=1) < bounded.coefficients.length)
+    assert near.any()
+    np.testing.assert_allclose(doubtful.predict(controls)[near], 0.5 * whole[near], atol=1e-5)
+
+
 def test_it_comes_back_from_its_file(bounded, layout, motion, tmp_path: Path) -> None:
     poses = PoseRange(pose_quaternions(motion(9, 1).rotations, (1, 2)), (1, 2), 7.5)
-    known = KnownRange(poses, {"linear": bounded.controls}, bounded.coefficients, 1.25)
+    known = KnownRange(poses, {"linear": bounded.controls}, bounded.coefficients)
     save_known_range(tmp_path / "poses.safetensors", known, model_digest="a")
     found = load_known_range(tmp_path / "poses.safetensors", model_digest="a")
-    assert (found.safe_deg, found.stretch_p99, found.poses.joints) == (10.0, 1.25, (1, 2))
+    assert (found.safe_deg("linear"), found.poses.joints) == (10.0, (1, 2))
     np.testing.assert_array_equal(found.controls["linear"].poses, bounded.controls.poses)
     np.testing.assert_array_equal(found.coefficients.largest, bounded.coefficients.largest)
     controls = control_vectors(layout, turned(motion(9, 9), 30.0))
@@ -185,7 +216,7 @@ def test_a_range_of_another_regressor_is_one_line(bounded, layout, motion, said:
     if said == "a part less":
         controls = replace(controls, largest=controls.largest[:-1])
     shapes = len(bounded.coefficients.std)
-    known = KnownRange(replace(poses, joints=layout.joints), {"linear": controls}, bounded.coefficients, 1.25)
+    known = KnownRange(replace(poses, joints=layout.joints), {"linear": controls}, bounded.coefficients)
     if said == "a joint more":
         known, layout = replace(known, poses=poses), replace(layout, joints=(1, 3))
     with pytest.raises(InputError, match=fault):
@@ -194,5 +225,5 @@ def test_a_range_of_another_regressor_is_one_line(bounded, layout, motion, said:
 
 def test_a_range_of_its_own_regressor_is_taken(bounded, layout, motion) -> None:
     poses = PoseRange(pose_quaternions(motion(9, 1).rotations, layout.joints), layout.joints, 7.5)
-    known = KnownRange(poses, {"linear": bounded.controls}, bounded.coefficients, 1.25)
+    known = KnownRange(poses, {"linear": bounded.controls}, bounded.coefficients)
     known.require("linear", layout, len(bounded.coefficients.std))
