@@ -27,7 +27,7 @@ from wrinkles.normal_maps.inference import generator_path, load_model
 from wrinkles.normal_maps.pair_files import layout_digest
 from wrinkles.normal_maps.spaces import encode_png, encode_png8, flip_green
 from wrinkles.normal_maps.template import MapTemplate
-from wrinkles.normal_maps.wrinkle_maps import MapMaker
+from wrinkles.normal_maps.wrinkle_maps import MapMaker, require_size
 
 __all__ = ["run"]
 
@@ -53,7 +53,8 @@ def run(
     Args:
         model: folder of `wrinkles train`, or its generator.safetensors.
     Raises:
-        InputError: there is no registration, no usable model, or the model was trained on another template's UVs.
+        InputError: there is no registration, no usable model, the model was trained on another template's UVs, or its
+            layout does not permit maps of that size.
     """
     weights = generator_path(model)
     generator, digest = load_model(weights), work.registered_digest
@@ -62,6 +63,7 @@ def run(
     if layout_digest(template.mesh, generator.maps.size) != generator.layout_digest:
         raise InputError(f"expected the template that {weights} was trained on, found another mesh or UV layout",
                          where=work.path)  # fmt: skip
+    require_size(generator, config.texels)
     upstream = {"registration": digest, "model": file_digest([weights], root=weights.parent)}
     stage = open_stage(
         work.path / "wrinkles" / "generated", name="wrinkles apply", schema=SCHEMA,

@@ -188,6 +188,7 @@ PRESETS: Mapping[str, WrinkleConfig] = {
         network=replace(_SMALL.network, filters=16, layers=8),
         schedule=replace(_SMALL.schedule, steps=12_000, batch=2, half_precision=False),
     ),
+    "small-512": replace(_SMALL, texels=512, crop=128),
     "paper": WrinkleConfig(),
 }
 """`paper` is DeepWrinkles as printed, with pix2pix's defaults where it is silent; the others learn on a CPU."""

@@ -125,6 +125,7 @@ def find_gutter(mesh: Mesh, raster: UvRaster) -> Gutter:
     exact, good = _barycentric(mesh.uv[faces].astype(float), uv)
     good &= raster.inside[at]
     barycentric[good] = exact[good]
+    uv = np.einsum("mk,mkd->md", barycentric.astype(float), mesh.uv[faces].astype(float))
     return Gutter(
         texels, uv, faces, barycentric, np.stack([points.own_face[nearest], points.other_face[nearest]]),
         np.stack([points.own_barycentric[nearest], points.other_barycentric[nearest]]).astype(np.float32),

@@ -20,7 +20,7 @@ from wrinkles.normal_maps.inference import WrinkleModel, load_model
 from wrinkles.normal_maps.pair_files import layout_digest
 from wrinkles.normal_maps.template import MapTemplate
 
-__all__ = ["MapMaker", "wrinkle_map"]
+__all__ = ["MapMaker", "require_size", "wrinkle_map"]
 
 
 LARGEST = 8192
@@ -50,11 +50,8 @@ class MapMaker:
         """
         if layout_digest(template.mesh, template.raster.size) != model.layout_digest:
             raise InputError("template: expected the one that the network was trained on, found another mesh or layout")
-        referred = template.referred_to(model.template.vertices)
-        least, size = model.maps.smallest, texels or model.maps.size
-        if not least <= size <= LARGEST:
-            reach = f"from {least}, so that the layout's islands stay apart, to {LARGEST}"
-            raise InputError(f"texels: expected {reach}, found {size}")
+        require_size(model, texels)
+        referred, size = template.referred_to(model.template.vertices), texels or model.maps.size
 
         def sized(size: int) -> MapTemplate:
             return referred if size == referred.raster.size else referred.at(model.maps.sized(size))
@@ -82,6 +79,17 @@ class MapMaker:
         """The same as a map in tangent space, relative to the garment as it lies; OpenGL's +Y, flat where it shows
         nothing."""
         return self.template.tangent_image(self.normals(vertices), vertices)
+
+
+def require_size(model: WrinkleModel, texels: int | None) -> None:
+    """
+    Raises:
+        InputError: the layout of a network's maps does not permit so many texels, or so few.
+    """
+    least = model.maps.smallest
+    if texels is not None and not least <= texels <= LARGEST:
+        reach = f"from {least}, so that the layout's islands stay apart, to {LARGEST}"
+        raise InputError(f"texels: expected {reach}, found {texels}")
 
 
 def _lengths(vectors: np.ndarray) -> np.ndarray:

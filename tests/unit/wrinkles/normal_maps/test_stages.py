@@ -298,8 +298,10 @@ def test_a_network_without_anything_to_say_leaves_maps_flat_at_every_size(traine
         weights.data.zero_()
     vertices = np.array(load_registration(work / "registration").vertices[0])
     for texels in (64, 300):
-        image = wrinkle_map(kept, vertices, texels=texels)
-        np.testing.assert_allclose(image, np.broadcast_to([0, 0, 1], image.shape), atol=2e-3)
+        off = np.abs(wrinkle_map(kept, vertices, texels=texels) - [0, 0, 1]).max(axis=-1)
+        raster = MapTemplate.laid_out(kept.template, kept.maps.sized(texels)).raster
+        assert off[raster.image(raster.inside)].max() < 5e-3
+        assert off.max() < 0.1  # beyond the corners of an island, where seams end
 
 
 def test_sizes_that_cannot_be_are_one_line(work: Path, trained: Path, tmp_path: Path, capsys):
@@ -307,7 +309,8 @@ def test_sizes_that_cannot_be_are_one_line(work: Path, trained: Path, tmp_path: 
         line = fails(capsys, "wrinkles", "apply", trained, work, "--workers", "1", "--texels", texels)
         assert f"texels: expected from 16, so that the layout's islands stay apart, to 8192, found {texels}" in line
     assert not (work / "wrinkles" / "generated").exists()
-    line = fails(capsys, "wrinkles", "maps", work, "--texels", "128", "--pairs.map.size", "64", "--workers", "1")
+    assert run("wrinkles", "maps", work, "--texels", "128", "--pairs.map.size", "64", "--workers", "1") == 2
+    line = capsys.readouterr().err
     assert "--texels: expected the 64 of --pairs.map.size, or one of the two alone, found 128" in line
     line = fails(capsys, *train(work, tmp_path / "x", "--crop", "48"))
     assert "crop: expected at most the 32 texels of the maps, found 48" in line
