@@ -31,6 +31,7 @@ from wrinkles.offset_images.config import OffsetConfig
 
 if TYPE_CHECKING:
     from capture4d.app.differences.work_diff import WorkDiff
+    from capture4d.app.status.survey import WorkStatus
     from capture4d.calibration.check import CameraCheck
     from capture4d.calibration.stage import CalibrationResult
     from capture4d.preflight.check import Checked
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "animate", "calibrate", "check", "check_rig", "compare", "diff", "extract", "fit", "register", "register_mesh",
-    "report", "run", "scan", "synth", "synth_board", "template", "track", "wrinkles_apply", "wrinkles_maps",
+    "report", "run", "scan", "status", "synth", "synth_board", "template", "track", "wrinkles_apply", "wrinkles_maps",
     "wrinkles_offsets", "wrinkles_train",
 ]  # fmt: skip
 
@@ -505,6 +506,13 @@ def diff(first: AnyWork, second: AnyWork, page: Place | None = None, *, overwrit
     if page is not None:
         write_page(found, Path(page), overwrite=overwrite)
     return found
+
+
+def status(work: AnyWork) -> WorkStatus:
+    """Tell what is done in a work folder, what is running, stale or damaged, and why; which frames are flagged."""
+    from capture4d.app.status.survey import survey
+
+    return survey(_path(work))
 
 
 def _capture(capture: AnyCapture) -> Capture:
