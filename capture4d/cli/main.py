@@ -188,6 +188,9 @@ def _dispatch(arguments: list[str]) -> int:
         return _complain(f"unknown command '{name}'{hint} (see capture4d --help)", code=BAD_COMMAND_LINE)
     command = _parse(name, rest)
     require_address_space(name)
+    if getattr(command, "dry_run", False):  # nothing is written: no lock, not even a folder
+        with _allowing(command):
+            return command()
     with _allowing(command), _alone(command):
         return command()
 

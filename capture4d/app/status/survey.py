@@ -27,7 +27,7 @@ from capture4d.runs.locks import Holder, holders
 from capture4d.runs.made import Ledger
 from capture4d.runs.stage import read_record
 
-__all__ = ["StageStatus", "WorkStatus", "as_json", "survey"]
+__all__ = ["StageStatus", "WorkStatus", "as_json", "logged_costs", "survey"]
 
 State = Literal["done", "running", "stopped", "stale", "damaged"]
 CHAIN = {"garment": "extract", "body": "track", "registration": "register", "report": "report"}
@@ -105,7 +105,7 @@ def survey(path: Path) -> WorkStatus:
             raise InputError(f"'{running[0].command or 'another command'}' is just beginning there", where=path)
         raise InputError(f"expected a work folder, found {_what_is_there(path)}", where=path)
     place, take, changes, notes = _take(path, records)
-    costs = _logged(path / LOG)
+    costs = logged_costs(path)
     stages: dict[str, StageStatus] = {}
     for folder in sorted(records, key=lambda folder: ([*CHAIN].index(folder) if folder in CHAIN else 9, folder)):
         is_held = any((path / folder).is_relative_to(holder.place.parent) for holder in running)
@@ -287,10 +287,10 @@ def _wall(record: Mapping[str, Any]) -> float | None:
         return None
 
 
-def _logged(path: Path) -> dict[str, tuple[float, float]]:
+def logged_costs(work: Path) -> dict[str, tuple[float, float]]:
     """Wall and CPU seconds of each stage, all its runs together, as the folder's log tells them."""
     costs: dict[str, tuple[float, float]] = {}
-    with contextlib.suppress(OSError), path.open(encoding="utf-8", errors="replace") as lines:
+    with contextlib.suppress(OSError), (work / LOG).open(encoding="utf-8", errors="replace") as lines:
         for line in lines:
             try:
                 said = json.loads(line)

@@ -1,17 +1,19 @@
-"""The status of a work folder as text for a terminal, a pipe or a log."""
+"""The status of a work folder, and the plan of a run, as text for a terminal, a pipe or a log."""
 
 from __future__ import annotations
 
 from datetime import datetime
 
 from capture4d.app.differences.table import aligned
+from capture4d.app.status.plan import Plan, StagePlan
 from capture4d.app.status.survey import StageStatus, WorkStatus
 from capture4d.captures.frame_ranges import frame_ranges
 from capture4d.runs.locks import Holder
 
-__all__ = ["duration", "size", "status_lines"]
+__all__ = ["duration", "plan_lines", "size", "status_lines"]
 
 _MOST_RANGES = 8
+WOULD = {"do": "be done", "go on": "go on", "renew": "be redone", "nothing": "stay", "refuse": "REFUSE"}
 
 
 def status_lines(found: WorkStatus) -> list[str]:
@@ -74,3 +76,33 @@ def _moment(text: str) -> str:
         return datetime.fromisoformat(text).astimezone().strftime("%Y-%m-%d %H:%M")
     except ValueError:
         return text
+
+
+def plan_lines(plan: Plan) -> list[str]:
+    """What would be done, why, about how long it takes, and what it needs of the disk."""
+    head = ("stage", "would", "frames to do", "perhaps", "kept", "CPU", "disk")
+    lines = [*aligned([head, *map(_plan_row, plan.stages)], left=(0, 1)), ""]
+    lines += [f"{stage.name}: {why}" for stage in plan.stages for why in stage.why]
+    if any(stage.is_guess and stage.cpu_most_s for stage in plan.stages):
+        lines.append("~ is a guess: nothing was done yet from which it is known")
+    if plan.refuses:
+        return [*lines, "Nothing was done. This command would refuse."]
+    least, most = plan.wall_s
+    if not most:
+        return [*lines, "Nothing was done, and nothing is to do."]
+    span = duration(most) if duration(least) == duration(most) else f"{duration(least)} to {duration(most)}"
+    processes = "1 process" if plan.workers == 1 else f"{plan.workers} processes"
+    lines.append(
+        f"About {span} with {processes}; {size(plan.bytes)} more on the disk, where {size(plan.free_bytes)} are free."
+    )
+    if plan.bytes > plan.free_bytes:
+        lines.append("That is more than is free.")
+    return [*lines, "Nothing was done."]
+
+
+def _plan_row(stage: StagePlan) -> tuple[str, ...]:
+    by_frames = (str(stage.to_do), str(stage.perhaps or ""), str(stage.kept)) if stage.frames else ("", "", "")
+    spans = dict.fromkeys(duration(seconds) for seconds in (stage.cpu_s, stage.cpu_most_s))
+    guess = "~" if stage.is_guess else ""
+    cpu = f"{guess}{' to '.join(spans)}" if stage.cpu_most_s else ""
+    return stage.name, WOULD[stage.state], *by_frames, cpu, size(stage.bytes) if stage.bytes else ""
