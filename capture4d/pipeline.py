@@ -14,10 +14,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 from capture4d.app.compare.config import CompareConfig
+from capture4d.app.status.work_folders import changes, diff, made_anew, needs_tracking, status
+from capture4d.app.status.work_folders import plan as plan
 from capture4d.calibration.config import CalibrationConfig, RigCheckConfig
 from capture4d.captures.capture import Capture, read_capture
 from capture4d.captures.work_folder import WorkFolder, open_work
-from capture4d.runs.changes import StageChanges
 from capture4d.runs.decisions import forget_decisions, take_over_decisions
 from capture4d.runs.run_log import logged_stage
 from capture4d.runs.stage import StageResult
@@ -31,7 +32,6 @@ from wrinkles.normal_maps.config import ApplyConfig, PairConfig, WrinkleConfig
 from wrinkles.offset_images.config import OffsetConfig
 
 if TYPE_CHECKING:
-    from capture4d.app.differences.work_diff import WorkDiff
     from capture4d.calibration.check import CameraCheck
     from capture4d.calibration.stage import CalibrationResult
     from capture4d.preflight.check import Checked
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "animate", "calibrate", "check", "check_rig", "compare", "diff", "extract", "fit", "register", "register_mesh",
-    "report", "run", "scan", "synth", "synth_board", "template", "track", "wrinkles_apply", "wrinkles_maps",
+    "report", "run", "scan", "status", "synth", "synth_board", "template", "track", "wrinkles_apply", "wrinkles_maps",
     "wrinkles_offsets", "wrinkles_train",
 ]  # fmt: skip
 
@@ -53,12 +53,7 @@ AnyWork: TypeAlias = WorkFolder | Place
 
 @logged_stage("extract")
 def extract(
-    capture: AnyCapture,
-    work: AnyWork,
-    *,
-    learn_colours: bool = False,
-    workers: int = 1,
-    overwrite: bool = False,
+    capture: AnyCapture, work: AnyWork, *, learn_colours: bool = False, workers: int = 1, overwrite: bool = False
 ) -> StageResult:
     """Cut the garment out of every scan by its colour, and find its painted borders: WORK/garment.
 
@@ -68,13 +63,8 @@ def extract(
     from capture4d.extraction.stage import ExtractionSettings
     from capture4d.extraction.stage import run as stage
 
-    return stage(
-        _capture(capture),
-        _path(work) / "garment",
-        ExtractionSettings(learn_colours=learn_colours),
-        workers=workers,
-        overwrite=overwrite,
-    )
+    config = ExtractionSettings(learn_colours=learn_colours)
+    return stage(_capture(capture), _path(work) / "garment", config, workers=workers, overwrite=overwrite)
 
 
 @logged_stage("track")
@@ -90,11 +80,7 @@ def track(
     from capture4d.tracking.stage import run as stage
 
     return stage(
-        _capture(capture),
-        _path(work) / "body",
-        config or TrackingConfig(),
-        workers=workers,
-        overwrite=overwrite,
+        _capture(capture), _path(work) / "body", config or TrackingConfig(), workers=workers, overwrite=overwrite
     )
 
 
@@ -170,10 +156,10 @@ def run(
         The registration's result; its path is the page of the report, if that was drawn.
     """
     opened, folder = _capture(capture), _path(work)
-    tracked = tracked or _needs_tracking(opened)
+    tracked = tracked or needs_tracking(opened)
     if not tracked:
         _ = opened.poses  # what is wrong with it is said before the work, not after
-    anew = _made_anew(changes(opened, folder, config, tracking=tracking, tracked=tracked)) if overwrite else ()
+    anew = made_anew(changes(opened, folder, config, tracking=tracking, tracked=tracked)) if overwrite else ()
     extract(opened, folder, workers=workers, overwrite="extract" in anew)
     if tracked:
         track(opened, folder, tracking, workers=workers, overwrite="track" in anew)
@@ -182,38 +168,6 @@ def run(
         return registered
     page = report(folder, capture=opened, workers=workers, overwrite=overwrite).path
     return replace(registered, path=page)
-
-
-def changes(
-    capture: AnyCapture,
-    work: AnyWork,
-    config: RegistrationConfig | None = None,
-    *,
-    tracking: TrackingConfig | None = None,
-    tracked: bool = False,
-) -> list[StageChanges]:
-    """What the stages of `run` would do again, and why, in their order; nothing is done, nor written.
-
-    Frames that a stage would do because of what comes out of a stage before it are among its `following`, at least.
-    """
-    from capture4d.extraction.stage import ExtractionSettings
-    from capture4d.extraction.stage import changes as extraction
-    from capture4d.tracking.stage import changes as track_changes
-    from registration.stage import changes as registration
-
-    opened, folder = _capture(capture), _path(work)
-    found = [extraction(opened, folder / "garment", ExtractionSettings())]
-    tracked = tracked or _needs_tracking(opened)
-    if tracked:
-        found.append(track_changes(opened, folder / "body", tracking or TrackingConfig()))
-    last = registration(
-        opened,
-        folder / "garment",
-        folder / "registration",
-        config or RegistrationConfig(),
-        body_folder=folder / "body" if tracked else None,
-    )
-    return [*found, last.after(found)]
 
 
 def renew(work: AnyWork, what: Collection[str]) -> None:
@@ -233,17 +187,6 @@ def take_over(work: AnyWork, like: AnyWork) -> None:
         like: work folder of a take of the same person, in the same clothes.
     """
     take_over_decisions(_path(work), _path(like))
-
-
-def _made_anew(found: Sequence[StageChanges]) -> tuple[str, ...]:
-    """The stages that --overwrite is meant for: the first whose settings have changed and those after it, or all."""
-    first = next((at for at, stage in enumerate(found) if stage.settings), 0)
-    return tuple(stage.name for stage in found[first:])
-
-
-def _needs_tracking(capture: Capture) -> bool:
-    """Whether the template is bound to a body of which the capture has no poses."""
-    return capture.template.skin_weights is not None and not (capture.path / "poses.npz").is_file()
 
 
 @logged_stage("calibrate")
@@ -501,23 +444,6 @@ def compare(
 
     learned, config = _maybe(garment_model), config or CompareConfig()
     return stage(_work(work), Path(model), config, garment_model=learned, workers=workers, overwrite=overwrite)
-
-
-def diff(first: AnyWork, second: AnyWork, page: Place | None = None, *, overwrite: bool = False) -> WorkDiff:
-    """Compare two work folders, finished or not: settings, metrics, and frames by their numbers.
-
-    Args:
-        first: what there was; `second`, what it has become.
-        page: HTML file to write, with the curves of both.
-        overwrite: write it over a file that is something else.
-    """
-    from capture4d.app.differences.page import write_page
-    from capture4d.app.differences.work_diff import diff_works
-
-    found = diff_works(_work(first), _work(second))
-    if page is not None:
-        write_page(found, Path(page), overwrite=overwrite)
-    return found
 
 
 def _capture(capture: AnyCapture) -> Capture:

@@ -20,7 +20,7 @@ from capture4d.cli.answers import TerminatedError, answer_to, complain
 from capture4d.cli.commands.capture import Calibrate, Check, CheckRig
 from capture4d.cli.commands.doctor import Doctor
 from capture4d.cli.commands.files import ConvertBody, ConvertPoses, ConvertRig, RegisterMesh, Template
-from capture4d.cli.commands.folders import Diff
+from capture4d.cli.commands.folders import Diff, Status
 from capture4d.cli.commands.models import Animate, Fit
 from capture4d.cli.commands.stages import Extract, Register, Report, Run, Track
 from capture4d.cli.commands.synthesis import Demo, Scan, Synth, SynthBoard
@@ -51,6 +51,7 @@ COMMANDS: Mapping[str, Any] = {
     "register": Register,
     "run": Run,
     "report": Report,
+    "status": Status,
     "diff": Diff,
     "fit": Fit,
     "animate": Animate,
@@ -144,6 +145,9 @@ def _dispatch(arguments: list[str]) -> int:
         return GOOD
     command = parse(name, kind, rest, presets)
     require_address_space(name)
+    if getattr(command, "dry_run", False):  # nothing is written: no lock, no log, not even a folder
+        with _showing(command), _allowing(command):
+            return command()
     with _showing(command), _allowing(command), _alone(command):
         return _logged(command, arguments)
 

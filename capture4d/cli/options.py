@@ -96,11 +96,15 @@ class DecidingOptions(TakeOptions):
     """Find anew what the whole take decides and is kept otherwise when frames come or go: shape, colours, or both with
     a comma between."""
 
+    @property
+    def to_renew(self) -> list[str]:
+        return [name.strip() for name in self.renew.split(",") if name.strip()]
+
     def renewed(self, work: Path) -> None:
         """Let a work folder find anew what is to be."""
         from capture4d.runs.decisions import forget_decisions
 
-        forget_decisions(work, [name.strip() for name in self.renew.split(",") if name.strip()])
+        forget_decisions(work, self.to_renew)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,22 +4,41 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import json
 import os
+import platform
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 
 from capture4d.errors import InputError
 
-__all__ = ["LOCK", "alone"]
+__all__ = ["LOCK", "Holder", "alone", "holders"]
 
 LOCK = ".capture4d.lock"
 """In a folder that is written to; of a single file, `.NAME` stands before it. It goes when the command ends; one that a
 kill left behind holds nobody up."""
 _POLL_S = 0.2
+_LOOKS = 3
+"""How often a lock is tried before its folder is said to be taken: whoever asks who holds it has it for a moment."""
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 """What a file system answers that knows no locks."""
+
+
+@dataclass(frozen=True, slots=True)
+class Holder:
+    """A command that is writing now, as far as its lock tells."""
+
+    place: Path
+    """The lock's."""
+    command: str = ""
+    process: int | None = None
+    machine: str = ""
+    since: str = ""
+    """ISO 8601, UTC."""
 
 
 @contextlib.contextmanager
@@ -43,6 +62,7 @@ def alone(output: Path, *, folder: bool, wait: bool | None = False) -> Iterator[
     try:
         handle = _waited_for(lock, output, wait)
         try:
+            _sign(handle)
             yield
         finally:
             with contextlib.suppress(OSError):
@@ -54,9 +74,57 @@ def alone(output: Path, *, folder: bool, wait: bool | None = False) -> Iterator[
                 each.rmdir()
 
 
+def holders(folder: Path) -> list[Holder]:
+    """The commands that are writing to a folder, to those in it, or to files of it, at this moment."""
+    locks = [path for pattern in (f"*{LOCK}", f"*/*{LOCK}") for path in sorted(folder.glob(pattern))]
+    return [_holder(path) for path in locks if _is_held(path)]
+
+
+def _is_held(lock: Path) -> bool:
+    """Whether a process holds a lock; a file that a kill left behind nobody does."""
+    try:
+        handle = os.open(lock, os.O_RDWR if sys.platform == "win32" else os.O_RDONLY)
+    except OSError:  # it has just ended, or it is somebody else's, of whom nothing can be known
+        return False
+    try:
+        _lock(handle)
+    except BlockingIOError:
+        return True
+    except OSError:  # of a file system that knows no locks
+        return False
+    finally:
+        os.close(handle)
+    return False
+
+
+def _sign(handle: int) -> None:
+    """Say in a lock who holds it: for people, and only where it can be written."""
+    signature = {
+        "command": " ".join(["capture4d", *sys.argv[1:]]),
+        "process": os.getpid(),
+        "machine": platform.node(),
+        "since": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+    with contextlib.suppress(OSError):
+        os.ftruncate(handle, 0)
+        os.write(handle, json.dumps(signature).encode())
+
+
+def _holder(lock: Path) -> Holder:
+    try:
+        said = json.loads(lock.read_text(encoding="utf-8"))
+        return Holder(lock, str(said["command"]), int(said["process"]), str(said["machine"]), str(said["since"]))
+    except (OSError, ValueError, KeyError, TypeError):  # not signed, or, where locks forbid reading, not to be read
+        return Holder(lock)
+
+
 def _waited_for(lock: Path, output: Path, wait: bool | None) -> int:
-    told = False
+    told, looks = False, 0
     while (handle := _taken(lock)) is None:
+        looks += 1
+        if not wait and looks < _LOOKS:
+            time.sleep(_POLL_S)
+            continue
         if not wait:
             option = "" if wait is None else ", or with --wait"
             raise InputError(

@@ -100,6 +100,10 @@ class Ledger:
         """What each file of one of the stage's folders was made from, by its place."""
         return {place: made.inputs for place, made in self._made.items() if place.rpartition("/")[0] == folder}
 
+    def said_of(self, folder: str) -> dict[str, Mapping[str, Any]]:
+        """What is to be known of each file of one of the stage's folders, by its place."""
+        return {place: made.said for place, made in self._made.items() if place.rpartition("/")[0] == folder}
+
     def stands(self, path: Path, inputs: Mapping[str, str]) -> bool:
         """Whether a file is there, whole, and was made from the same."""
         made = self.of(path)

@@ -11,7 +11,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from capture4d.cli.exit_codes import BAD_RESULT, GOOD
 
-__all__ = ["Diff"]
+__all__ = ["Diff", "Status"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,3 +53,24 @@ class Diff:
         for line in broken:
             print(f"capture4d: {line}", file=sys.stderr)
         return BAD_RESULT if broken else GOOD
+
+
+@dataclass(frozen=True, kw_only=True)
+class Status:
+    """Tell what is done in a work folder, what is running, stale or damaged, and why; which frames are flagged."""
+
+    folder: Annotated[Positional[Path], arg(metavar="WORK")]
+    """Work folder of a take or an animation; another command may be writing to it."""
+    json: bool = False
+    """Print JSON instead of a table."""
+
+    def __call__(self) -> int:
+        import json
+
+        from capture4d import pipeline
+        from capture4d.app.status.survey import as_json
+        from capture4d.app.status.table import status_lines
+
+        found = pipeline.status(self.folder)
+        print(json.dumps(as_json(found), indent=2) if self.json else "\n".join(status_lines(found)))
+        return BAD_RESULT if found.is_damaged else GOOD

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
+from capture4d.cli.dry_run import DryRunOptions
 from capture4d.cli.exit_codes import BAD_RESULT, GOOD
 from capture4d.cli.options import DecidingOptions, GradedOptions, MeshOptions, StageOptions, TakeOptions
 from capture4d.cli.verdict import say_flagged, say_verdict, say_work
@@ -19,7 +20,7 @@ __all__ = ["Extract", "Register", "Report", "Run", "Track"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Extract(DecidingOptions, StageOptions, MeshOptions):
+class Extract(DryRunOptions, DecidingOptions, StageOptions, MeshOptions):
     """Cut the garment out of every scan by its colour, and find its painted borders."""
 
     capture: Annotated[Positional[Path], arg(metavar="CAPTURE")]
@@ -32,8 +33,15 @@ class Extract(DecidingOptions, StageOptions, MeshOptions):
 
     def __call__(self) -> int:
         from capture4d import pipeline
+        from capture4d.app.status.work_folders import plan_stage
+        from capture4d.extraction.stage import ExtractionSettings
 
         taken = self.taken(self.capture)
+        if self.dry_run:
+            return self.told(plan_stage(
+                taken, self.output, ExtractionSettings(learn_colours=self.learn_colours),
+                renew=self.to_renew, workers=self.workers, overwrite=self.overwrite,
+            ))  # fmt: skip
         self.renewed(self.output)
         result = pipeline.extract(
             taken,
@@ -51,7 +59,7 @@ class Extract(DecidingOptions, StageOptions, MeshOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Track(DecidingOptions, StageOptions, MeshOptions):
+class Track(DryRunOptions, DecidingOptions, StageOptions, MeshOptions):
     """Track the body through every scan: its poses, and one shape for the take."""
 
     capture: Annotated[Positional[Path], arg(metavar="CAPTURE")]
@@ -62,8 +70,14 @@ class Track(DecidingOptions, StageOptions, MeshOptions):
 
     def __call__(self) -> int:
         from capture4d import pipeline
+        from capture4d.app.status.work_folders import plan_stage
 
         taken = self.taken(self.capture)
+        if self.dry_run:
+            return self.told(plan_stage(
+                taken, self.output, self.config,
+                renew=self.to_renew, workers=self.workers, overwrite=self.overwrite,
+            ))  # fmt: skip
         self.renewed(self.output)
         result = pipeline.track(taken, self.output, self.config, workers=self.workers, overwrite=self.overwrite)
         say_flagged(f"lost in {len(result.failed)} of {result.frames} frames", result.failed)
@@ -73,7 +87,7 @@ class Track(DecidingOptions, StageOptions, MeshOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Register(TakeOptions, GradedOptions, MeshOptions):
+class Register(DryRunOptions, TakeOptions, GradedOptions, MeshOptions):
     """Register the template to every frame whose garment `extract` has cut out."""
 
     capture: Annotated[Positional[Path], arg(metavar="CAPTURE")]
@@ -88,9 +102,16 @@ class Register(TakeOptions, GradedOptions, MeshOptions):
 
     def __call__(self) -> int:
         from capture4d import pipeline
+        from capture4d.app.status.work_folders import plan_stage
 
+        taken = self.taken(self.capture)
+        if self.dry_run:
+            return self.told(plan_stage(
+                taken, self.output, self.config,
+                tracked=self.tracked, workers=self.workers, overwrite=self.overwrite,
+            ))  # fmt: skip
         result = pipeline.register(
-            self.taken(self.capture),
+            taken,
             self.output,
             self.config,
             tracked=self.tracked,
@@ -103,7 +124,7 @@ class Register(TakeOptions, GradedOptions, MeshOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Run(DecidingOptions, GradedOptions, MeshOptions):
+class Run(DryRunOptions, DecidingOptions, GradedOptions, MeshOptions):
     """Run every stage on a capture: extract, track if it brings no poses, register, report."""
 
     capture: Annotated[Positional[Path], arg(metavar="CAPTURE")]
@@ -121,6 +142,11 @@ class Run(DecidingOptions, GradedOptions, MeshOptions):
         from capture4d import pipeline
 
         taken = self.taken(self.capture)
+        if self.dry_run:
+            return self.told(pipeline.plan(
+                taken, self.output, self.config, tracking=self.tracking, tracked=self.track,
+                renew=self.to_renew, workers=self.workers, overwrite=self.overwrite,
+            ))  # fmt: skip
         self.renewed(self.output)
         result = pipeline.run(
             taken,

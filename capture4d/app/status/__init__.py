@@ -1,0 +1,1 @@
+"""What has been done in a work folder, what is stale and why, and what a run would do."""
