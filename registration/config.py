@@ -189,6 +189,13 @@ class QualityConfig:
     """Share of faces against the scan's normals above which a frame is to be checked."""
     intersections_check_percent: Percent = 10.0
     """Share of faces that cut another face above which a frame is to be checked."""
+    region_far_percent: Percent = 5.0
+    """Share of a region's vertices, of those with scan data, more than 2 mm from it, above which a frame is to be
+    checked."""
+    region_cut_percent: Percent = 12.0
+    """Share of a region's faces that cut another face above which a frame is to be checked."""
+    region_creased_percent: Percent = 12.0
+    """Share of a region's edges folded by more than 60 degrees above which a frame is to be checked."""
     min_covered_percent: Percent = 40.0
     """Share of vertices with scan data below which a frame has failed."""
 

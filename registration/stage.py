@@ -40,7 +40,7 @@ from registration.template import TemplateAnalysis, analyse_template
 
 __all__ = ["run"]
 
-SCHEMA = 3
+SCHEMA = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -164,6 +164,7 @@ def _write_frame(stage: Stage, result: FrameResult) -> None:
             "verdict": result.quality.verdict,
             "reasons": list(result.quality.reasons),
             **numbers,
+            "regions": {name: nan_to_none(measures) for name, measures in result.quality.regions.items()},
             "cpu_s": round(result.cpu_s, 4),
             "started_from": result.started_from,
             "iterations": result.linear_iterations,

@@ -42,7 +42,7 @@ FORMER_STAGES = {former: name for name, former in FORMER_NAMES.items()}
 
 
 SCHEMAS = {
-    "animate": 1, "calibrate": 1, "compare": 5, "extract": 4, "fit": 5, "register": 3, "report": 4, "scan": 2,
+    "animate": 1, "calibrate": 1, "compare": 5, "extract": 4, "fit": 5, "register": 4, "report": 4, "scan": 2,
     "synth": 2, "synth-board": 1, "track": 4, "training-set": 1, "wrinkles apply": 2, "wrinkles maps": 1,
     "wrinkles offsets": 1, "wrinkles train": 1,
 }  # fmt: skip
