@@ -22,8 +22,6 @@ __all__ = ["Gates", "Matches", "ScanSurface", "match", "match_both_ways", "mesh_
 
 SECOND_LAYER = 2.0
 """A vertex whose nearest scan vertex looks another way may take one so many scan spacings beside it that does not."""
-NEARER_SHARE = 0.7
-"""A scan point belongs to another part of the template if that part's distance to it is less than this share."""
 CELL_SPACINGS = 3.0
 """Edge of a search cell in scan spacings: some nine points in each cell that the surface passes through."""
 
@@ -134,6 +132,8 @@ def of_another_part(
     own: Integer[np.ndarray, " queries"],
     vertices: Float64[np.ndarray, "verts 3"],
     rest: Float64[np.ndarray, "verts 3"],
+    *,
+    share: float,
     reach: float,
 ) -> Bool[np.ndarray, " queries"]:
     """Whether what was found for a template vertex is the scan of another part of the template.
@@ -147,6 +147,7 @@ def of_another_part(
         own: the vertices they were found for.
         vertices: of the whole template, as it lies.
         rest: the same at rest, metres.
+        share: the other part is nearer than this share of the distance.
         reach: parts of the template lie at least so far from each other at rest, metres.
     """
     foreign = np.zeros(len(own), bool)
@@ -155,7 +156,7 @@ def of_another_part(
         return foreign
     nearer, owner = PointGrid.build(vertices, reach).query(targets[doubtful])
     apart = np.linalg.norm(rest[owner] - rest[own[doubtful]], axis=1)
-    foreign[doubtful] = (nearer < NEARER_SHARE * distances[doubtful]) & (apart > reach)
+    foreign[doubtful] = (nearer < share * distances[doubtful]) & (apart > reach)
     return foreign
 
 
