@@ -73,6 +73,9 @@ class DataConfig:
     """What a normal turned by 60 degrees counts as among distances under both_ways, metres."""
     min_normal_cosine: Cosine = 0.4
     """Reject a match whose normals differ by more than this angle's cosine."""
+    other_part_share: Share = 0.5
+    """Reject a match if another part of the template lies nearer to it than this share of its distance: what is nearest
+    to cloth in an armpit is the scan of the sleeve that hides it (rule plane); 0 rejects none."""
     robust_scale: Positive = 0.4
     """Scale of the Geman-McClure weight, as a share of the distance gate."""
     point_share: Share = 0.0
@@ -189,6 +192,13 @@ class QualityConfig:
     """Share of faces against the scan's normals above which a frame is to be checked."""
     intersections_check_percent: Percent = 10.0
     """Share of faces that cut another face above which a frame is to be checked."""
+    region_far_percent: Percent = 5.0
+    """Share of a region's vertices, of those with scan data, more than 2 mm from it, above which a frame is to be
+    checked."""
+    region_cut_percent: Percent = 12.0
+    """Share of a region's faces that cut another face above which a frame is to be checked."""
+    region_creased_percent: Percent = 12.0
+    """Share of a region's edges folded by more than 60 degrees above which a frame is to be checked."""
     min_covered_percent: Percent = 40.0
     """Share of vertices with scan data below which a frame has failed."""
 
@@ -212,7 +222,7 @@ NO_STEPS = Schedule(0, (0.03, 0.012))
 
 PAPER = RegistrationConfig(
     graph=GraphConfig(nodes=800, vertices=0),
-    data=DataConfig(point_share=1.0, smoothing_passes=0),
+    data=DataConfig(point_share=1.0, smoothing_passes=0, other_part_share=0.0),
     boundary=BoundaryConfig(coarse_rule="argmax", dense_rule="argmax", along_curve=False),
     coarse=CoarseConfig(cold=PAPER_SCHEDULE, warm=PAPER_SCHEDULE),
     dense=DenseConfig(cold=NO_STEPS, warm=NO_STEPS),

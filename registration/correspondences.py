@@ -126,6 +126,40 @@ def match(
     return Matches(target, target_normal, gates.weigh(off_plane, ~found | (cosine < gates.normal_cosine)))
 
 
+def of_another_part(
+    targets: Float64[np.ndarray, "queries 3"],
+    distances: Float64[np.ndarray, " queries"],
+    own: Integer[np.ndarray, " queries"],
+    vertices: Float64[np.ndarray, "verts 3"],
+    rest: Float64[np.ndarray, "verts 3"],
+    *,
+    share: float,
+    reach: float,
+) -> Bool[np.ndarray, " queries"]:
+    """Whether what was found for a template vertex is the scan of another part of the template.
+
+    Where a sleeve hides the side of a shirt, the scan nearest to the hidden cloth is the sleeve's: some vertex of the
+    sleeve lies nearer to it, and far from the hidden vertex on the template.
+
+    Args:
+        targets: scan points that were found.
+        distances: from each vertex to what was found for it, metres.
+        own: the vertices they were found for.
+        vertices: of the whole template, as it lies.
+        rest: the same at rest, metres.
+        share: the other part is nearer than this share of the distance.
+        reach: parts of the template lie at least so far from each other at rest, metres.
+    """
+    foreign = np.zeros(len(own), bool)
+    doubtful = np.flatnonzero(distances > 0.0)
+    if not len(doubtful):
+        return foreign
+    nearer, owner = PointGrid.build(vertices, reach).query(targets[doubtful])
+    apart = np.linalg.norm(rest[owner] - rest[own[doubtful]], axis=1)
+    foreign[doubtful] = (nearer < share * distances[doubtful]) & (apart > reach)
+    return foreign
+
+
 def match_both_ways(
     surface: ScanSurface,
     points: Float64[np.ndarray, "queries 3"],

@@ -19,12 +19,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32, Float64, Int32
 
 from capture4d.body.skinning import ShapedBody, pose_frame, skin, unskin, with_shape
 from capture4d.errors import InputError
 from capture4d.types import Body, PoseSequence
 from registration.config import RegistrationConfig
+from registration.regions import find_regions
 from registration.register import FrameScan
 from registration.template import TemplateAnalysis
 
@@ -47,6 +48,8 @@ class Mover:
     poses: PoseSequence
     rest: Float64[np.ndarray, "verts 3"]
     skin_weights: Float32[np.ndarray, "verts joints"]
+    regions: Mapping[str, Int32[np.ndarray, " region"]]
+    """Of the template, by which limbs carry it."""
 
     @staticmethod
     def create(analysis: TemplateAnalysis, body: Body | None, poses: PoseSequence | None) -> Mover | None:
@@ -59,7 +62,8 @@ class Mover:
                 f"poses and template: expected the body's {len(body.joint_names)} joints, found "
                 f"{len(poses.joint_names)} in the poses and {weights.shape[1]} in the template's skin weights"
             )
-        return Mover(with_shape(body, poses.shape), poses, analysis.rest, weights)
+        regions = find_regions(analysis.garment, body.joint_names)
+        return Mover(with_shape(body, poses.shape), poses, analysis.rest, weights, regions)
 
     def skinned(self, index: int) -> Float64[np.ndarray, "verts 3"]:
         """The template in the pose of the index-th frame."""

@@ -15,7 +15,15 @@ from capture4d.errors import InputError
 from capture4d.types import GarmentScan
 from registration.boundary import BorderTargets, border_targets, tangent_free_metric
 from registration.config import BoundaryRule, RegistrationConfig, Schedule
-from registration.correspondences import Gates, ScanSurface, match, match_both_ways, mesh_normals, prepare_scan
+from registration.correspondences import (
+    Gates,
+    ScanSurface,
+    match,
+    match_both_ways,
+    mesh_normals,
+    of_another_part,
+    prepare_scan,
+)
 from registration.deformation_graph import identity_nodes, node_edge_rows, rows_of_vertices, smooth_rows
 from registration.energies import edge_vectors, plane_metric, rigid_term, stretch_metric, tangential_metric
 from registration.fold_lengths import folded_lengths
@@ -23,6 +31,9 @@ from registration.solver import Rows, RowTerm, gauss_newton_step
 from registration.template import TemplateAnalysis, require_borders
 
 __all__ = ["FrameRegistration", "FrameScan", "prepare_frame", "register_frame"]
+
+PART_EDGES = 2.5
+"""Cloth farther away than so many mean edges at rest is another part of the template."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,8 +143,7 @@ def _coarse_stage(
     vertices = start
     for step in range(schedule.steps):
         at = (step, schedule.steps)
-        normals = mesh_normals(vertices, analysis.faces)[subset]
-        terms = [_data_term(data_rows, scan.surface, vertices[subset], normals, anneal(schedule.gate, *at), config)]
+        terms = [_data_term(analysis, data_rows, scan.surface, vertices, subset, anneal(schedule.gate, *at), config)]
         if step == 0 and not terms[0].metric.any():
             raise InputError(
                 f"frame {scan.frame_id}: expected scan vertices within {schedule.gate[0]:g} m of the start, found none"
@@ -173,6 +183,7 @@ def _dense_stage(
     near: bool,
 ) -> tuple[np.ndarray, int]:
     count = len(vertices)
+    every = np.arange(count)
     iterations = 0
     border_rows = Rows(
         np.arange(len(analysis.border.vertices) + 1, dtype=np.int32),
@@ -187,9 +198,8 @@ def _dense_stage(
         )
     for step in range(schedule.steps):
         at = (step, schedule.steps)
-        normals = mesh_normals(vertices, analysis.faces)
         gate = anneal(schedule.gate, *at)
-        terms = [_data_term(analysis.vertex_rows, scan.surface, vertices, normals, gate, config)]
+        terms = [_data_term(analysis, analysis.vertex_rows, scan.surface, vertices, every, gate, config)]
         terms += _border_terms(
             analysis, border_rows, scan, vertices, anneal(schedule.boundary, *at), config.boundary.gate,
             rule=config.boundary.dense_rule, along_curve=config.boundary.along_curve,
@@ -204,7 +214,7 @@ def _dense_stage(
         terms.append(RowTerm(analysis.laplacian_rows, smooth, (1.0 - config.dense.plasticity) * bending))
         anchor = anneal(schedule.anchor, *at)
         if anchor > 0.0:
-            weights = np.full(count, anchor / count)
+            weights, normals = np.full(count, anchor / count), mesh_normals(vertices, analysis.faces)
             terms.append(RowTerm(analysis.vertex_rows, tangential_metric(normals, weights), vertices - start))
         change, used = gauss_newton_step(
             terms, None, count, damping=1e-6,
@@ -216,15 +226,31 @@ def _dense_stage(
 
 
 def _data_term(
-    rows: Rows, surface: ScanSurface, points: np.ndarray, normals: np.ndarray, gate: float, config: RegistrationConfig
+    analysis: TemplateAnalysis,
+    rows: Rows,
+    surface: ScanSurface,
+    vertices: np.ndarray,
+    chosen: np.ndarray,
+    gate: float,
+    config: RegistrationConfig,
 ) -> RowTerm:
-    data = config.data
+    """Pull the chosen vertices to the scan."""
+    data, points = config.data, vertices[chosen]
+    normals = mesh_normals(vertices, analysis.faces)[chosen]
     gates = Gates(gate, data.min_normal_cosine, data.robust_scale)
     if data.rule == "both_ways":
         voters, length = data.max_voters, data.normal_length
         found = match_both_ways(surface, points, normals, gates, neighbours=3, max_points=voters, normal_length=length)
     else:
         found = match(surface, points, normals, gates)
+        if data.other_part_share > 0.0:
+            away = np.where(found.weights > 0.0, np.linalg.norm(points - found.points, axis=1), 0.0)
+            reach = PART_EDGES * float(analysis.rest_lengths.mean())
+            found.weights[
+                of_another_part(
+                    found.points, away, chosen, vertices, analysis.rest, share=data.other_part_share, reach=reach
+                )
+            ] = 0.0
     metric = plane_metric(found.normals, found.weights / len(points), data.point_share)
     return RowTerm(rows, metric, points - found.points)
 

@@ -133,6 +133,7 @@ def _register_one(
             at,
         )
     vertices = fitted.vertices.astype(np.float32)
-    quality = assess(analysis, scan, vertices.astype(np.float64), config.quality)
+    regions = None if mover is None else mover.regions
+    quality = assess(analysis, scan, vertices.astype(np.float64), config.quality, regions=regions)
     cpu_s = time.process_time() - begin
     return FrameResult(frame_id, vertices, quality, f"{name}, {schedule}", fitted.linear_iterations, cpu_s, index, at)

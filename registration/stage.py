@@ -332,6 +332,7 @@ def _write_frame(stage: Stage, result: FrameResult) -> None:
             "verdict": result.quality.verdict,
             "reasons": list(result.quality.reasons),
             **numbers,
+            "regions": {name: nan_to_none(measures) for name, measures in result.quality.regions.items()},
             "cpu_s": round(result.cpu_s, 4),
             "started_from": result.started_from,
             "iterations": result.linear_iterations,

@@ -7,22 +7,35 @@ nothing is checked.
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float64, Integer
+from jaxtyping import Bool, Float64, Integer
 from scipy.spatial import KDTree
 
 from capture4d.heavy_imports import njit
 
-__all__ = ["closest_in_triangle", "closest_on_faces", "count_intersecting_faces", "fan_distances"]
+__all__ = [
+    "closest_in_triangle",
+    "closest_on_faces",
+    "count_intersecting_faces",
+    "fan_distances",
+    "self_intersections",
+]
 
 
 def count_intersecting_faces(vertices: Float64[np.ndarray, "verts 3"], faces: Integer[np.ndarray, "faces 3"]) -> int:
     """Faces that cut another face they share no vertex with."""
+    return int(self_intersections(vertices, faces).sum())
+
+
+def self_intersections(
+    vertices: Float64[np.ndarray, "verts 3"], faces: Integer[np.ndarray, "faces 3"]
+) -> Bool[np.ndarray, " faces"]:
+    """Which faces cut another face they share no vertex with."""
     corners = vertices[faces]
     centre = corners.mean(axis=1)
     reach = np.sqrt(((corners - centre[:, None]) ** 2).sum(axis=2).max(axis=1))
     radius = 2.0 * float(np.percentile(reach, 99))
     pairs = KDTree(centre, balanced_tree=False).query_pairs(radius, output_type="ndarray")
-    return int(intersecting_faces(vertices, faces, pairs).sum())
+    return intersecting_faces(vertices, faces, pairs)
 
 
 @njit(cache=True, inline="always")

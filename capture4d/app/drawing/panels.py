@@ -24,6 +24,7 @@ from capture4d.types import Garment, Scan
 __all__ = [
     "NO_SCAN",
     "VIEWS",
+    "WEBP",
     "Framing",
     "Panel",
     "Scale",

@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 
 from capture4d.app.drawing.charts import Line, joined_chart
-from capture4d.app.drawing.page import Badge, Chart, Tile, render_page
+from capture4d.app.drawing.film import make_film, rows_around, tiled
+from capture4d.app.drawing.page import Badge, Chart, Film, Tile, render_page
 from capture4d.app.drawing.palette import BLUE, CLOTH, GREEN, GREY, HEIGHT, ORANGE, SKIN, WIDTH
 from capture4d.app.drawing.panels import VIEWS, Framing, Panel, data_uri
-from capture4d.app.drawing.render import Drawn, render
+from capture4d.app.drawing.render import Drawn, View, render
 from capture4d.app.report.flagged import FLAGGED_NOTE, flagged_table, verdict_counts, verdict_runs
 from capture4d.app.report.metrics import column, shown
 from capture4d.app.report.take import is_current, spread
@@ -30,7 +31,7 @@ from capture4d.runs.workers import run_jobs, shared
 __all__ = ["ANIMATION_METRICS", "run"]
 
 SCHEMA = 2
-PICTURES = 8
+PICTURES, FILM_FRAMES = 8, 48
 
 ANIMATION_METRICS: Mapping[str, tuple[str, str, str]] = {
     "frames_good_percent": ("%", "higher", "frames with the verdict good"),
@@ -72,6 +73,7 @@ def run(work: WorkFolder, *, workers: int = 1, overwrite: bool = False) -> Stage
     x, y, z = np.max([np.ptp(sequence.vertices[row], axis=0) for row in rows], axis=0).tolist()
     draw = partial(_draw_row, framing=Framing((1.3 * x, 1.15 * y, 1.3 * z)))
     pictures = dict(run_jobs(draw, rows, prepare=shared(work), workers=workers, label="draw"))
+    film = _film(work, records, workers)
     metrics = [
         {"key": key, "value": value, "unit": ANIMATION_METRICS[key][0], "better": ANIMATION_METRICS[key][1]}
         for key, value in summary.items()
@@ -79,7 +81,7 @@ def run(work: WorkFolder, *, workers: int = 1, overwrite: bool = False) -> Stage
     write_json(
         folder / "metrics.json", {"metrics": metrics, "capture": work.path.resolve().name, "frames": len(records)}
     )
-    write_bytes(folder / "index.html", _page(work, records, summary, pictures).encode())
+    write_bytes(folder / "index.html", _page(work, records, summary, pictures, film).encode())
     return stage.finish([], output=folder / "index.html")
 
 
@@ -98,8 +100,38 @@ def summarise(records: Sequence[Mapping[str, Any]]) -> dict[str, float]:
             if key in special or key in records[0]}  # fmt: skip
 
 
+def _film(work: WorkFolder, records: Sequence[Mapping[str, Any]], workers: int) -> Film:
+    """Consecutive frames around the one with most of the garment inside the body before it was taken out."""
+    worst = max(range(len(records)), key=lambda row: records[row].get("inside_before_percent") or 0.0)
+    rows, sequence = rows_around(len(records), FILM_FRAMES, worst), work.registered
+    x, y, z = np.max([np.ptp(sequence.vertices[row], axis=0) for row in rows], axis=0).tolist()
+    draw = partial(_film_row, framing=Framing((1.3 * x, 1.15 * y, 1.3 * z)))
+    drawn = dict(run_jobs(draw, list(rows), prepare=shared(work), workers=workers, label="film"))
+    chosen = [records[row] for row in rows]
+    return make_film(
+        f"Frames {chosen[0]['frame_id']} to {chosen[-1]['frame_id']}, one by one",
+        [drawn[row] for row in rows],
+        ["; ".join([f"Frame {each['frame_id']}, {each['verdict']}", *each["reasons"]]) for each in chosen],
+        seconds=1.0 / work.require_posed_body()[1].fps,
+        note="The garment on the body, from the front and from behind. The slider stops at a frame.",
+    )
+
+
+def _film_row(work: WorkFolder, row: int, *, framing: Framing) -> tuple[int, np.ndarray]:
+    drawn, views = _posed(work, row, framing)
+    return row, tiled([[render(drawn, view, width=WIDTH, height=HEIGHT) for view in views]])
+
+
 def _draw_row(work: WorkFolder, row: int, *, framing: Framing) -> tuple[int, list[Panel]]:
     """The garment on the body, from both sides."""
+    drawn, views = _posed(work, row, framing)
+    return row, [
+        Panel(direction.replace("_", " "), data_uri(render(drawn, view, width=WIDTH, height=HEIGHT)))
+        for direction, view in zip(VIEWS, views, strict=True)
+    ]
+
+
+def _posed(work: WorkFolder, row: int, framing: Framing) -> tuple[list[Drawn], list[View]]:
     sequence, (body, poses) = work.registered, work.require_posed_body()
     vertices = np.array(sequence.vertices[row])
     posed = pose_frame(with_shape(body, poses.shape), poses, row).vertices().astype(np.float32)
@@ -107,11 +139,7 @@ def _draw_row(work: WorkFolder, row: int, *, framing: Framing) -> tuple[int, lis
         Drawn(sequence.garment.template.with_vertices(vertices), CLOTH),
         Drawn(body.template.with_vertices(posed), SKIN),
     ]
-    views = [framing.view(vertices, direction) for direction in VIEWS]
-    return row, [
-        Panel(direction.replace("_", " "), data_uri(render(drawn, view, width=WIDTH, height=HEIGHT)))
-        for direction, view in zip(VIEWS, views, strict=True)
-    ]
+    return drawn, [framing.view(vertices, direction) for direction in VIEWS]
 
 
 def _page(
@@ -119,6 +147,7 @@ def _page(
     records: Sequence[Mapping[str, Any]],
     summary: Mapping[str, float],
     pictures: Mapping[int, Sequence[Panel]],
+    film: Film,
 ) -> str:
     stage, poses = work.stages["registration"], work.require_posed_body()[1]
     template = work.registered.garment.template
@@ -148,6 +177,7 @@ def _page(
         ),
         flagged_note=FLAGGED_NOTE,
         regions=None,
+        regions_note="",
         charts=_charts(records),
         columns=4,
         calibration=None,
@@ -156,7 +186,7 @@ def _page(
         extraction=[],
         tracked=[],
         scales=[],
-        films=[],
+        films=[film],
         pictures_note="The garment on the body, from the front and from behind.",
         frames=[
             {

@@ -1,14 +1,17 @@
-"""The verdict of `capture4d check`: a status, JSON for machines, a table for people."""
+"""The verdict of `capture4d check`: a status, JSON for machines, a table and a page for people."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any, Literal
 
+from capture4d.app.drawing.page import Badge, Column, Table, render_page
 from capture4d.captures.frame_ranges import frame_ranges
+from capture4d.files.atomic import write_bytes
 from capture4d.preflight.check import Checked
 from capture4d.preflight.findings import Verdict
 
-__all__ = ["as_json", "print_table", "status"]
+__all__ = ["as_json", "print_table", "status", "write_page"]
 
 LEARNED = (
     "No garment_colour is given: extract and track will learn the colours from the scans. "
@@ -51,6 +54,32 @@ def as_json(checked: Checked) -> dict[str, Any]:
     }
 
 
+def write_page(path: Path, checked: Checked) -> Path:
+    """Write the verdict as a self-contained HTML page; its path."""
+    columns = [Column("severity"), Column("finding"), Column("frames"), Column("what was found"), Column("what to do")]
+    rows = [
+        [Badge(each.severity), each.code, frame_ranges(each.frames), each.found, each.advice]
+        for each in checked.verdict.findings
+    ]
+    scores = sorted(checked.verdict.scores.items(), key=lambda item: -item[1])
+    page = render_page(
+        "capture4d.app.report",
+        "check.html.jinja",
+        title=checked.take.path.resolve().name,
+        subtitle=str(checked.take.path),
+        status=Badge(status(checked.verdict)),
+        looked=f"{checked.frames} of {len(checked.take.files)} frames looked at",
+        notes=[LEARNED] if _learns(checked) else [],
+        findings=Table(columns, rows, stacks=True),
+        scores=Table(
+            [Column("finding"), Column("measured over limit", number=True)],
+            [[code, f"{score:.2f}"] for code, score in scores],
+        ),
+    )
+    write_bytes(path, page.encode())
+    return path
+
+
 def _learns(checked: Checked) -> bool:
     """The take does not say which colour its garment has."""
     return checked.take.facts.paints.garment is None
@@ -65,12 +94,14 @@ def _counted(verdict: Verdict) -> str:
 
 def print_table(checked: Checked) -> None:
     from rich.console import Console
-    from rich.table import Table
+    from rich.table import Table as TerminalTable
 
     console = Console()
     looked = f"{checked.frames} of {len(checked.take.files)} frames"
     if checked.verdict.findings:
-        table = Table("", "finding", "what was found", "what to do", title=f"{checked.take.path} ({looked} looked at)")
+        table = TerminalTable(
+            "", "finding", "what was found", "what to do", title=f"{checked.take.path} ({looked} looked at)"
+        )
         for finding in checked.verdict.findings:
             frames = f"\nframes {frame_ranges(finding.frames, most=6)}" if finding.frames else ""
             table.add_row(finding.severity, finding.code, finding.found + frames, finding.advice)

@@ -6,7 +6,7 @@ docs/reference/report.md explains them.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -23,11 +23,17 @@ from capture4d.captures.truth import TruthModel
 from capture4d.captures.work_folder import VERDICTS
 from capture4d.types import RegisteredSequence
 
-__all__ = ["METRICS", "column", "own_measures", "shown", "summarise", "truth_measures"]
+__all__ = ["METRICS", "column", "own_measures", "region_rows", "shown", "summarise", "truth_measures"]
+
+FAR_MM = 2.0
+"""A vertex farther off than this is counted in `..._beyond_percent`."""
 
 METRICS: Mapping[str, tuple[str, str, str]] = {
     "fit_mean_mm": ("mm", "lower", "template vertices to the scan's surface, where it has data"),
     "fit_p95_mm": ("mm", "lower", "the same, 95th percentile of a frame"),
+    "fit_p99_mm": ("mm", "lower", "the same, 99th percentile of a frame"),
+    "fit_max_mm": ("mm", "lower", "the same, the farthest vertex of the take"),
+    "fit_beyond_percent": ("%", "lower", "template vertices with scan data that are more than 2 mm from it"),
     "scan_fit_mean_mm": ("mm", "lower", "scan points to the template"),
     "scan_fit_p95_mm": ("mm", "lower", "the same, 95th percentile of a frame"),
     "boundary_mean_mm": ("mm", "lower", "template border to the painted border of the scan, and back"),
@@ -37,6 +43,7 @@ METRICS: Mapping[str, tuple[str, str, str]] = {
     "stretch_p99_worst": ("", "lower", "the same of the worst frame"),
     "flipped_faces": ("", "lower", "faces against the scan they lie on, per frame"),
     "self_intersections": ("", "lower", "faces that cut another, per frame"),
+    "creased_percent": ("%", "lower", "edges folded by more than 60 degrees, though not at rest"),
     "frames_good_percent": ("%", "higher", "frames with the verdict good"),
     "frames_check": ("", "lower", "frames with the verdict check"),
     "frames_failed": ("", "lower", "frames with the verdict failed"),
@@ -48,6 +55,11 @@ METRICS: Mapping[str, tuple[str, str, str]] = {
     "joint_max_mm": ("mm", "lower", "the same, worst joint of a frame"),
     "truth_distance_mean_mm": ("mm", "lower", "template vertices with scan data to the noise-free surface"),
     "truth_distance_p95_mm": ("mm", "lower", "the same, 95th percentile of a frame"),
+    "truth_distance_p99_mm": ("mm", "lower", "the same, 99th percentile of a frame"),
+    "truth_distance_max_mm": ("mm", "lower", "the same, the farthest vertex of the take"),
+    "truth_distance_beyond_percent": ("%", "lower", "of the same vertices, those more than 2 mm off"),
+    "truth_hidden_mean_mm": ("mm", "lower", "template vertices without scan data to the noise-free surface"),
+    "truth_hidden_p95_mm": ("mm", "lower", "the same, 95th percentile of a frame"),
     "truth_return_mean_mm": ("mm", "lower", "the noise-free surface to the template"),
     "truth_return_p95_mm": ("mm", "lower", "the same, 95th percentile of a frame"),
     "correspondence_mean_mm": ("mm", "lower", "template vertices to the true places of the same material"),
@@ -58,6 +70,17 @@ METRICS: Mapping[str, tuple[str, str, str]] = {
     "border_p95_mm": ("mm", "lower", "the same, 95th percentile of a frame"),
 }
 """Unit, better direction and meaning of every metric. Unless it says otherwise, it is the mean over the frames."""
+
+OF_FRAMES = ("joint_max_mm",)
+"""Largest of a frame, averaged over the frames; the other largest ones are those of the take."""
+REGION_MEASURES: Mapping[str, Callable[[np.ndarray], Any]] = {
+    "fit_p95_mm": np.mean,
+    "fit_max_mm": np.max,
+    "fit_beyond_percent": np.max,
+    "cut_percent": np.max,
+    "creased_percent": np.max,
+    "covered_percent": np.min,
+}
 
 
 def summarise(records: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
@@ -84,8 +107,28 @@ def summarise(records: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
             summary[key] = special[key]
         elif any(key in record for record in records):
             values = column(records, key)
-            summary[key] = float(values[np.isfinite(values)].mean()) if np.isfinite(values).any() else None
+            found = values[np.isfinite(values)]
+            of_take = np.max if key.endswith("_max_mm") and key not in OF_FRAMES else np.mean
+            summary[key] = float(of_take(found)) if len(found) else None
     return summary
+
+
+def region_rows(records: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, float | None]]:
+    """Of each region of the garment: its usual fit, and its worst frame in every other measure.
+
+    Empty where the registration has not told regions apart.
+    """
+    found: dict[str, list[Mapping[str, Any]]] = {}
+    for record in records:
+        for name, measures in record.get("regions", {}).items():
+            found.setdefault(name, []).append(measures)
+
+    def over(name: str, key: str, how: Callable[[np.ndarray], Any]) -> float | None:
+        values = column(found[name], key)
+        values = values[np.isfinite(values)]
+        return float(how(values)) if len(values) else None
+
+    return {name: {key: over(name, key, how) for key, how in REGION_MEASURES.items()} for name in found}
 
 
 def truth_measures(
@@ -95,7 +138,9 @@ def truth_measures(
     garment = registered.garment
     vertices = np.asarray(registered.vertices[row])
     mesh, truth = garment.template.with_vertices(vertices), model.fine.with_vertices(truth_vertices)
-    there, back = truth_distances(mesh, truth, covered=np.isfinite(registered.residual_m[row]))
+    covered = np.isfinite(registered.residual_m[row])
+    away, back = truth_distances(mesh, truth)
+    there, hidden = away[covered], away[~covered]
     places = material_points(truth_vertices, truth.faces, model.template_faces, model.template_barycentric)
     border = border_errors(
         {name: vertices[loop] for name, loop in garment.loops.items()},
@@ -104,6 +149,7 @@ def truth_measures(
     measures = {}
     for name, errors in (
         ("truth_distance", there),
+        ("truth_hidden", hidden),
         ("truth_return", back),
         ("correspondence", correspondence_errors(vertices, places)),
         ("border", border),
@@ -111,6 +157,10 @@ def truth_measures(
         if len(errors):
             measures[f"{name}_mean_mm"] = 1e3 * float(errors.mean())
             measures[f"{name}_p95_mm"] = 1e3 * float(np.percentile(errors, 95))
+    if len(there):
+        measures["truth_distance_p99_mm"] = 1e3 * float(np.percentile(there, 99))
+        measures["truth_distance_max_mm"] = 1e3 * float(there.max())
+        measures["truth_distance_beyond_percent"] = 100 * float((1e3 * there > FAR_MM).mean())
     return measures
 
 

@@ -15,7 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from capture4d.app.drawing.panels import Framing, Panel, Scale, draw_frame, readable_scan
+from capture4d.app.drawing.film import checks, make_film, rows_around, tiled
+from capture4d.app.drawing.page import Film
+from capture4d.app.drawing.palette import HEIGHT, WIDTH
+from capture4d.app.drawing.panels import VIEWS, Framing, Panel, Scale, draw_frame, readable_scan
+from capture4d.app.drawing.render import Drawn, heat_colours, render, trace
 from capture4d.app.report.metrics import METRICS, own_measures, summarise, truth_measures
 from capture4d.app.report.stages import calibration, comparison, comparison_digest, draw_stages, tracking
 from capture4d.app.report.take_page import Drawings, Stages, take_page
@@ -28,11 +32,13 @@ from capture4d.files.atomic import write_bytes, write_json, write_json_lines
 from capture4d.runs.made import digest_of
 from capture4d.runs.stage import StageResult, complete_record, open_stage, read_record, result_of
 from capture4d.runs.workers import run_jobs, shared
-from capture4d.settings import Count, settings
+from capture4d.settings import Count, Whole, settings
 
 __all__ = ["ReportConfig", "is_current", "run", "spread"]
 
 SCHEMA = 4
+FILM_WIDTH = 360
+"""Of one of the four pictures in a film, pixels."""
 FIT, CORRESPONDENCE = "fit error", "correspondence error"
 """Titles of what is drawn as errors."""
 
@@ -43,6 +49,8 @@ class ReportConfig:
 
     pictures: Count = 6
     """Frames drawn, spread over the take; the worst flagged frame comes on top."""
+    film_frames: Whole = 48
+    """Consecutive frames in the film at most, around the frame with the most faces that cut others; 0 for no film."""
     stage_pictures: Count = 3
     """Frames whose extraction and tracking are drawn."""
     truth_frames: Count = 240
@@ -96,6 +104,8 @@ def run(
     if tracked is not None:
         summary |= tracked.metrics
     drawings = _draw(scene, _drawn_rows(records, config.pictures), workers)
+    if config.film_frames:
+        drawings = replace(drawings, films=[_film(scene, records, drawings.scales[0], config.film_frames, workers)])
     stages = Stages(
         calibration(scene.capture, work.path),
         tracked,
@@ -209,6 +219,45 @@ def _draw_row(scene: _Scene, job: _DrawJob) -> tuple[int, list[Panel]]:
         job.framing,
         errors_mm={scale.title: (errors[scale.title], scale) for scale in job.scales if scale.title in errors},
         border_colours=capture.boundary_colours,
+    )
+
+
+def _film(scene: _Scene, records: Sequence[Mapping[str, Any]], scale: Scale, count: int, workers: int) -> Film:
+    """Consecutive frames: scan, registration under checks that stay with the cloth, and its fit."""
+    registered, capture = scene.work.registered, scene.capture
+    worst = max(range(len(records)), key=lambda row: records[row].get("self_intersections") or 0)
+    rows = rows_around(len(records), count, worst)
+    x, y, z = np.max([np.ptp(registered.vertices[row], axis=0) for row in rows], axis=0).tolist()
+    jobs = [_DrawJob(row, Framing((x, y, z)), [scale]) for row in rows]
+    drawn = dict(run_jobs(_film_row, jobs, prepare=shared(scene), workers=workers, label="film"))
+    ids = [int(records[row]["frame_id"]) for row in rows]
+    step = (ids[-1] - ids[0]) / max(len(ids) - 1, 1) / capture.fps
+    captions = [
+        "; ".join([f"Frame {records[row]['frame_id']}, {records[row]['verdict']}", *records[row]["reasons"]])
+        for row in rows
+    ]
+    return make_film(
+        f"Frames {ids[0]} to {ids[-1]}, one by one",
+        [drawn[row] for row in rows],
+        captions,
+        seconds=step,
+        note="Above: the scan, and the registration under checks that stay with the cloth. Below: the same from "
+        f"behind, and the fit error up to {scale.end}. The slider stops at a frame.",
+    )
+
+
+def _film_row(scene: _Scene, job: _DrawJob) -> tuple[int, np.ndarray]:
+    row, registered, (scale,) = job.row, scene.work.registered, job.scales
+    vertices, template = np.array(registered.vertices[row]), registered.garment.template
+    views = [job.framing.view(vertices, direction) for direction in VIEWS]
+    size = {"width": FILM_WIDTH, "height": FILM_WIDTH * HEIGHT // WIDTH}
+    scan = readable_scan(scene.capture, int(registered.frame_ids[row]))
+    scanned = [] if scan is None else [Drawn(scan.mesh, scan.colours)]
+    front, back = (trace([template.with_vertices(vertices)], view, **size) for view in views)
+    heat = heat_colours(1e3 * registered.residual_m[row].astype(float), high=scale.high)
+    cloth = checks(template)
+    return row, tiled(
+        [[render(scanned, views[0], **size), front.painted([cloth])], [back.painted([cloth]), front.painted([heat])]]
     )
 
 

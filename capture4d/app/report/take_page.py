@@ -16,7 +16,7 @@ from capture4d.app.drawing.page import Badge, Chart, Column, Film, Table, Tile, 
 from capture4d.app.drawing.palette import BLUE, GREEN, GREY, ORANGE
 from capture4d.app.drawing.panels import Panel, Scale
 from capture4d.app.report.flagged import FLAGGED_NOTE, flagged_table, verdict_counts, verdict_runs
-from capture4d.app.report.metrics import METRICS, column, shown
+from capture4d.app.report.metrics import METRICS, column, region_rows, shown
 from capture4d.app.report.stages import Calibration, Comparison, StagePictures, Tracking
 from capture4d.captures.capture import Capture
 from capture4d.captures.work_folder import VERDICTS, WorkFolder
@@ -30,7 +30,16 @@ CURVES: tuple[tuple[str, float, tuple[tuple[str, str, str], ...]], ...] = (
         (
             ("mean", "fit_mean_mm", BLUE),
             ("95 %", "fit_p95_mm", GREY),
+            ("99 %", "fit_p99_mm", ORANGE),
             ("scan to template", "scan_fit_mean_mm", GREEN),
+        ),
+    ),
+    (
+        "Farther than 2 mm, % of the vertices with scan data",
+        0.0,
+        (
+            ("from the scan", "fit_beyond_percent", BLUE),
+            ("from the true surface", "truth_distance_beyond_percent", ORANGE),
         ),
     ),
     ("Painted border, mm", 0.0, (("mean", "boundary_mean_mm", BLUE), ("95 %", "boundary_p95_mm", GREY))),
@@ -45,6 +54,7 @@ CURVES: tuple[tuple[str, float, tuple[tuple[str, str, str], ...]], ...] = (
     ),
     ("CPU time a frame, s", 0.0, (("registration", "cpu_s", BLUE),)),
     ("Stretch of edges", 1.0, (("99 %", "stretch_p99", BLUE),)),
+    ("Creased edges, %", 0.0, (("more than 60 degrees", "creased_percent", ORANGE),)),
     (
         "Faces at fault",
         0.0,
@@ -54,14 +64,33 @@ CURVES: tuple[tuple[str, float, tuple[tuple[str, str, str], ...]], ...] = (
 """Charts: title, start of the vertical axis, and curves (name, metric, colour)."""
 TILES: Mapping[str, str] = {
     "frames_good_percent": "frames are good",
-    "fit_mean_mm": "fit to the scan",
+    "fit_mean_mm": "fit to the scan, mean",
+    "fit_p99_mm": "the same, 99 %",
+    "fit_max_mm": "the same, farthest vertex",
+    "fit_beyond_percent": "of the vertices farther than 2 mm",
     "boundary_mean_mm": "painted border",
     "truth_distance_mean_mm": "distance to the true surface",
     "correspondence_mean_mm": "correspondence error",
     "border_mean_mm": "true border",
     "cpu_s": "CPU a frame, median",
 }
-FLAGGED_MEASURES = (("fit mean, mm", "fit_mean_mm"), ("border mean, mm", "boundary_mean_mm"))
+FLAGGED_MEASURES = (
+    ("cut faces", "self_intersections"),
+    ("fit 99 %, mm", "fit_p99_mm"),
+    ("border mean, mm", "boundary_mean_mm"),
+)
+REGION_COLUMNS = (
+    ("fit 95 %, mm", "fit_p95_mm"),
+    ("farthest, mm", "fit_max_mm"),
+    ("beyond 2 mm, %", "fit_beyond_percent"),
+    ("faces that cut, %", "cut_percent"),
+    ("creased edges, %", "creased_percent"),
+    ("least scan data, %", "covered_percent"),
+)
+REGIONS_NOTE = (
+    "Fit is the mean over the frames; every other figure is that of the region's worst frame. Where a region has "
+    "little scan data its cloth is hidden, and guessed."
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,7 +136,8 @@ def take_page(
         verdicts=verdict_counts(records, VERDICTS),
         flagged=flagged_table(records, measures=FLAGGED_MEASURES),
         flagged_note=FLAGGED_NOTE,
-        regions=None,
+        regions=_regions_table(records),
+        regions_note=REGIONS_NOTE,
         charts=list(_charts(records)),
         columns=2 + len(drawings.scales),
         films=drawings.films,
@@ -155,6 +185,23 @@ def flat(value: Any, prefix: str = "") -> Sequence[tuple[str, str]]:
     return [row for key, entry in value.items() for row in flat(entry, f"{prefix}.{key}" if prefix else key)]
 
 
+def _regions_table(records: Sequence[Mapping[str, Any]]) -> Table | None:
+    """Where on the garment it is good, the most creased and cut regions first."""
+    regions = region_rows(records)
+    if not regions:
+        return None
+    order = sorted(
+        regions, key=lambda name: -((regions[name]["cut_percent"] or 0) + (regions[name]["creased_percent"] or 0))
+    )
+    columns = [Column("region"), *(Column(heading, number=True) for heading, _ in REGION_COLUMNS)]
+    return Table(columns, [[name, *(_tenths(regions[name][key]) for _, key in REGION_COLUMNS)] for name in order])
+
+
+def _tenths(value: float | None) -> str:
+    """Two digits after the point below one, else one."""
+    return "–" if value is None else f"{value:.2f}" if abs(value) < 1 else f"{value:.1f}"
+
+
 def _tracking_part(tracked: Tracking | None) -> dict[str, Any] | None:
     """Tracking as the page shows it."""
     if tracked is None:
@@ -197,7 +244,13 @@ def _charts(records: Sequence[Mapping[str, Any]]) -> Sequence[Chart]:
 
 
 def _caption(record: Mapping[str, Any]) -> str:
-    named = {"fit": "fit_mean_mm", "border": "boundary_mean_mm", "correspondence": "correspondence_mean_mm"}
+    named = {
+        "fit": "fit_mean_mm",
+        "99 %": "fit_p99_mm",
+        "farthest": "fit_max_mm",
+        "border": "boundary_mean_mm",
+        "correspondence": "correspondence_mean_mm",
+    }
     parts = [f"{name} {shown(record[key])} mm" for name, key in named.items() if record.get(key) is not None]
     return " · ".join([*parts, *record["reasons"]])
 

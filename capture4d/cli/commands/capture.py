@@ -47,6 +47,8 @@ class Check(ProgressOptions, MeshOptions):
     """Exit code 3 for warnings, too."""
     json: bool = False
     """Print JSON instead of a table."""
+    page: Path | None = None
+    """An HTML page to write as well."""
     workers: Count = field(default_factory=all_cores)
     """Processes to use; the result does not depend on it."""
 
@@ -54,7 +56,7 @@ class Check(ProgressOptions, MeshOptions):
         import json
 
         from capture4d import pipeline
-        from capture4d.app.report.check import as_json, print_table, status
+        from capture4d.app.report.check import as_json, print_table, status, write_page
         from capture4d.preflight.fix import fixed_path
         from capture4d.preflight.take_folder import Claims
 
@@ -76,6 +78,8 @@ class Check(ProgressOptions, MeshOptions):
             print_table(checked)
             if checked.fixed is not None:
                 print(f"corrected: {checked.fixed}")
+        if self.page is not None:
+            write_page(self.page, checked)
         bad = ("warnings", "errors") if self.strict else ("errors",)
         return BAD_RESULT if status(checked.verdict) in bad else GOOD
 

@@ -8,7 +8,7 @@ import pytest
 from capture4d.geometry.mesh import boundary_edges, connected_components, vertex_normals
 from capture4d.geometry.mesh_kernels import face_components, laplacian_pass, open_vertices
 from capture4d.types import Mesh
-from registration.correspondences import Gates, match, match_both_ways, mesh_normals, prepare_scan
+from registration.correspondences import Gates, match, match_both_ways, mesh_normals, of_another_part, prepare_scan
 
 
 @pytest.fixture
@@ -100,3 +100,27 @@ def test_scan_beyond_the_edge_pulls_only_if_it_has_a_vote(tube: Callable[[int, i
     both = match_both_ways(surface, low, normals, gates, neighbours=3, max_points=5000, normal_length=0.05)
     assert (one_way.points - low)[top, 1].mean() < 0.01
     assert (both.points - low)[top, 1].mean() > 0.02
+
+
+def test_scan_of_another_part_is_told_from_a_vertex_s_own() -> None:
+    """Two sheets of one template, 3 cm apart, whose scan shows the front one alone."""
+    grid = np.stack(np.meshgrid(np.arange(10), np.arange(10)), axis=-1).reshape(-1, 2) * 0.01
+    front, back = (np.column_stack([grid, np.full(len(grid), z)]) for z in (0.0, -0.03))
+    vertices = np.concatenate([front, back])
+    rest = np.concatenate([front, back + np.array([0.5, 0, 0])])
+    targets = np.concatenate([front, front]) + np.array([0.0, 0.0, 0.001])
+    distances = np.linalg.norm(vertices - targets, axis=1)
+    own = np.arange(len(vertices))
+    foreign = of_another_part(targets, distances, own, vertices, rest, share=0.5, reach=0.03)
+    np.testing.assert_array_equal(foreign, own >= len(front))
+    slow = [
+        bool(any(
+            np.linalg.norm(vertices[u] - targets[v]) < 0.5 * distances[v] and np.linalg.norm(rest[u] - rest[v]) > 0.03
+            for u in [int(np.argmin(np.linalg.norm(vertices - targets[v], axis=1)))]
+        ))
+        for v in own
+    ]  # fmt: skip
+    np.testing.assert_array_equal(foreign, slow)
+    assert not of_another_part(targets, distances, own, vertices, rest, share=0.5, reach=1.0).any(), "it is one part"
+    near = np.where(own >= len(front), 0.0, distances)
+    assert not of_another_part(targets, near, own, vertices, rest, share=0.5, reach=0.03).any(), "nobody asked"

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from registration.config import QualityConfig
-from registration.quality import FrameQuality, assess, border_distances
+from registration.quality import REGION_MEASURES, FrameQuality, assess, border_distances
 from registration.register import prepare_frame
 from registration.template import analyse_template
 
@@ -122,3 +122,70 @@ def test_a_hidden_stretch_of_border_is_not_an_error(garment, scan_of, config) ->
     analysis = analyse_template(garment, config)
     quality = assess(analysis, prepare_frame(analysis, half, config), analysis.rest, QualityConfig())
     assert quality.numbers["boundary_mean_mm"] < 3
+
+
+def test_the_tail_of_the_fit_is_told_beside_its_mean(garment, scan_of, config) -> None:
+    """One vertex in 36 is 6 mm out: the mean hardly knows, the largest and the share beyond 2 mm do."""
+    analysis = analyse_template(garment, config)
+    frame = prepare_frame(analysis, scan_of(straight_through, around=216, along=103), config)
+    moved = analysis.rest.copy()
+    out = np.arange(36 * 5, 36 * 12, 36)
+    radial = moved[out] * [1, 0, 1]
+    moved[out] += 0.006 * radial / np.linalg.norm(radial, axis=1, keepdims=True)
+    numbers = assess(analysis, frame, moved, QualityConfig()).numbers
+    assert numbers["fit_mean_mm"] < 0.4
+    assert 4 < numbers["fit_max_mm"] < 6.5
+    assert numbers["fit_beyond_percent"] == 100 * len(out) / len(moved)
+    assert numbers["fit_p95_mm"] <= numbers["fit_p99_mm"] <= numbers["fit_max_mm"]
+
+
+def test_cloth_behind_another_part_is_unseen_and_no_error(garment, scan_of, config) -> None:
+    """A dent whose bottom lies 3 cm behind the wall across it: what is nearest to the bottom is not its own scan."""
+    analysis = analyse_template(garment, config)
+    scan = scan_of(straight_through)
+    frame = prepare_frame(analysis, scan, config)
+    assert assess(analysis, frame, analysis.rest, QualityConfig()).numbers["covered_percent"] == 100
+    through = analysis.rest.copy()
+    pushed = (through[:, 2] > 0.1) & (np.abs(through[:, 1] - 0.25) < 0.08)
+    through[pushed, 2] = through[:, 2].min() - 0.015  # out through the back
+    quality = assess(analysis, frame, through, QualityConfig())
+    assert np.isnan(quality.residual_m[pushed]).all(), "the back has vertices of its own for that scan"
+    assert np.isfinite(quality.residual_m[analysis.rest[:, 2] < -0.05]).all()
+    assert quality.numbers["fit_max_mm"] < 3
+
+
+def test_a_spike_in_its_own_cloth_is_an_error(garment, scan_of, config) -> None:
+    analysis = analyse_template(garment, config)
+    frame = prepare_frame(analysis, scan_of(straight_through), config)
+    moved = analysis.rest.copy()
+    vertex = 36 * 9
+    outwards = moved[vertex] * [1, 0, 1]
+    moved[vertex] += 0.012 * outwards / np.linalg.norm(outwards)
+    assert 0.008 < assess(analysis, frame, moved, QualityConfig()).residual_m[vertex] < 0.0125
+
+
+def test_regions_are_measured_and_judged(garment, scan_of, config) -> None:
+    """A band of the tube is crumpled: its region says so, the other does not, and the verdict names it."""
+    analysis = analyse_template(garment, config)
+    frame = prepare_frame(analysis, scan_of(straight_through, around=216, along=103), config)
+    height = analysis.rest[:, 1]
+    regions = {
+        "upper": np.flatnonzero(height > 0.25).astype(np.int32),
+        "lower": np.flatnonzero(height <= 0.25).astype(np.int32),
+    }
+    calm = assess(analysis, frame, analysis.rest, QualityConfig(), regions=regions)
+    assert calm.verdict == "good"
+    assert all(set(measures) == set(REGION_MEASURES) for measures in calm.regions.values())
+    crumpled = analysis.rest.copy()
+    rows = (np.arange(len(crumpled)) // 36) % 2 == 1
+    inside = rows & (height > 0.26)
+    crumpled[inside] -= (
+        0.05 * crumpled[inside] * [1, 0, 1] / np.linalg.norm(crumpled[inside] * [1, 0, 1], axis=1)[:, None]
+    )
+    lenient = QualityConfig(fit_fail_mm=1e3, stretch_fail=1e3, boundary_fail_mm=1e3)  # a failed frame says only why
+    quality = assess(analysis, frame, crumpled, lenient, regions=regions)
+    assert quality.regions["upper"]["creased_percent"] > 20
+    assert quality.regions["lower"]["creased_percent"] < 5
+    assert quality.regions["upper"]["fit_beyond_percent"] > quality.regions["lower"]["fit_beyond_percent"]
+    assert any(reason.startswith("upper: ") and "creased" in reason for reason in quality.reasons)
+    assert not any(reason.startswith("lower: ") for reason in quality.reasons)

@@ -29,7 +29,9 @@ FRAMES = 8
 def record(index, **changes):
     return {
         "frame_id": index, "verdict": "good", "reasons": [], "fit_mean_mm": 0.5, "fit_p95_mm": 1.0,
-        "boundary_mean_mm": None, "stretch_p99": 1.1, "cpu_s": 0.2 + 0.1 * (index == 0), **changes,
+        "boundary_mean_mm": None, "stretch_p99": 1.1, "cpu_s": 0.2 + 0.1 * (index == 0),
+        "regions": {"left armpit": {"fit_p95_mm": 0.4, "fit_max_mm": 3.0, "fit_beyond_percent": 1.0,
+                                    "cut_percent": 17.5, "creased_percent": 9.0, "covered_percent": 71.0}}, **changes,
     }  # fmt: skip
 
 
@@ -77,7 +79,7 @@ def metrics_of(work):
 
 
 def test_metrics_follow_their_definitions(work):
-    draw(work, config=ReportConfig(pictures=1))
+    draw(work, config=ReportConfig(film_frames=0, pictures=1))
     metrics = metrics_of(work)
     assert metrics["correspondence_mean_mm"] == pytest.approx(np.mean(1 + np.arange(FRAMES)), rel=1e-4)
     assert metrics["drift_mm_per_frame"] == pytest.approx(1, rel=1e-4)
@@ -97,13 +99,18 @@ def test_the_page_stands_alone_and_shows_what_it_should(work):
     assert page.count("data:image/webp") >= 6 * 2 * 4
     assert "a &lt;reason&gt; to escape" in page
     assert "Frame 5" in page  # the failed frame, drawn on top of the six
+    assert page.count("data-uri=") == FRAMES, "the film has every frame"
+    assert f'max="{FRAMES - 1}"' in page
+    assert re.search(r"<td>left armpit</td>.*17\.5.*71\.0", page)
+    assert "beyond, up to" in page or "no scan data" in page
     for chart in re.findall(r"<svg.*?</svg>", page, re.DOTALL):
         ElementTree.fromstring(chart)
     assert (work / "report" / "index.html").stat().st_size < 2e6
+    assert "data-uri=" not in draw(work, ReportConfig(film_frames=0)).path.read_text()
 
 
 def test_a_comparison_is_shown_and_makes_the_report_anew(work):
-    config = ReportConfig(pictures=1, truth_frames=1)
+    config = ReportConfig(film_frames=0, pictures=1, truth_frames=1)
     assert "Surfaces compared" not in draw(work, config=config).path.read_text()
     stage = open_stage(work / "compare", name="compare", schema=1, config=None, upstream={})
     write_panel(stage.path / "pictures" / "a.webp", Panel("map of the scan", data_uri(np.zeros((8, 8, 3), np.uint8))))
@@ -124,16 +131,16 @@ def test_a_comparison_is_shown_and_makes_the_report_anew(work):
 
 
 def test_a_report_is_made_once(work):
-    draw(work, config=ReportConfig(pictures=1))
+    draw(work, config=ReportConfig(film_frames=0, pictures=1))
     before = (work / "report" / "index.html").stat().st_mtime_ns
-    draw(work, config=ReportConfig(pictures=1))
+    draw(work, config=ReportConfig(film_frames=0, pictures=1))
     assert (work / "report" / "index.html").stat().st_mtime_ns == before
-    draw(work, config=ReportConfig(pictures=2))
+    draw(work, config=ReportConfig(film_frames=0, pictures=2))
     assert (work / "report" / "index.html").stat().st_mtime_ns != before
 
 
 def test_truth_on_every_nth_frame_keeps_the_slope(work):
-    draw(work, config=ReportConfig(pictures=1, truth_frames=3))
+    draw(work, config=ReportConfig(film_frames=0, pictures=1, truth_frames=3))
     assert metrics_of(work)["drift_mm_per_frame"] == pytest.approx(1, rel=0.1)
 
 
@@ -141,7 +148,7 @@ def test_a_capture_that_has_moved_is_named(work):
     (work / "capture").rename(work / "elsewhere")
     with pytest.raises(InputError, match="capture"):
         draw(work)
-    draw(work, capture=work / "elsewhere", config=ReportConfig(pictures=1, truth_frames=1))
+    draw(work, capture=work / "elsewhere", config=ReportConfig(film_frames=0, pictures=1, truth_frames=1))
 
 
 def test_an_unfinished_registration_names_the_repair(tmp_path, work):
@@ -153,7 +160,7 @@ def test_an_unfinished_registration_names_the_repair(tmp_path, work):
 
 def test_a_take_without_truth_has_no_truth_metrics(work):
     (work / "capture" / "truth" / "model.npz").unlink()
-    draw(work, config=ReportConfig(pictures=1))
+    draw(work, config=ReportConfig(film_frames=0, pictures=1))
     metrics = metrics_of(work)
     assert "correspondence_mean_mm" not in metrics
     assert "fit_mean_mm" in metrics
@@ -200,7 +207,7 @@ def test_tracking_is_shown_beside_the_truth(work):
                       "median_m": 0.0008, "inside": 0.0, "started_from": "motion", "cpu_s": 0.2})  # fmt: skip
     lines[3] |= {"verdict": "lost", "reasons": ["skin & suit are gone"], "median_m": None}
     write_bytes(work / "body" / "metrics.jsonl", "\n".join(json.dumps(line) for line in lines).encode())
-    page = draw(work, config=ReportConfig(pictures=1, stage_pictures=2)).path.read_text()
+    page = draw(work, config=ReportConfig(film_frames=0, pictures=1, stage_pictures=2)).path.read_text()
     metrics = metrics_of(work)
     assert metrics["joint_mean_mm"] == pytest.approx(2.0, rel=1e-4)
     assert metrics["track_good_percent"] == pytest.approx(87.5)
@@ -212,7 +219,7 @@ def test_tracking_is_shown_beside_the_truth(work):
 
 
 def test_a_report_without_tracking_and_rig_shows_neither(work):
-    page = draw(work, config=ReportConfig(pictures=1, stage_pictures=1)).path.read_text()
+    page = draw(work, config=ReportConfig(film_frames=0, pictures=1, stage_pictures=1)).path.read_text()
     assert "<h2>Tracking</h2>" not in page
     assert "<h2>Rig</h2>" not in page
     assert "<h2>Extraction</h2>" in page
@@ -226,7 +233,7 @@ def test_a_calibrated_rig_is_shown_with_its_uncertainty(work):
         "volume": [{"name": "000", "corner_rms_mm": 0.3}],
     }  # fmt: skip
     write_json(work / "capture" / "calibration.json", report)
-    page = draw(work, config=ReportConfig(pictures=1, stage_pictures=1)).path.read_text()
+    page = draw(work, config=ReportConfig(film_frames=0, pictures=1, stage_pictures=1)).path.read_text()
     assert "<h2>Rig</h2>" in page
     assert "1,234 corners" in page
     assert "0.123" in page
@@ -236,7 +243,7 @@ def test_a_calibrated_rig_is_shown_with_its_uncertainty(work):
 def test_the_truth_of_one_frame_may_be_damaged(work, damage: bytes | None):
     path = work / "capture" / "truth" / "000003.npz"
     path.unlink() if damage is None else path.write_bytes(damage)
-    draw(work, config=ReportConfig(pictures=4))
+    draw(work, config=ReportConfig(film_frames=0, pictures=4))
     metrics = metrics_of(work)
     assert (metrics["frames_check"], metrics["frames_failed"]) == (1, 1)
     assert metrics["drift_mm_per_frame"] == pytest.approx(1, rel=0.1)
@@ -247,7 +254,7 @@ def test_the_truth_of_one_frame_may_be_damaged(work, damage: bytes | None):
 def test_names_of_a_capture_are_escaped(work):
     path = work / "capture" / "capture.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "name": "<script>alert(1)</script>"}))
-    draw(work, config=ReportConfig(pictures=1))
+    draw(work, config=ReportConfig(film_frames=0, pictures=1))
     page = (work / "report" / "index.html").read_text()
     assert "<script>alert" not in page
     assert "&lt;script&gt;alert(1)" in page
