@@ -11,14 +11,13 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 from capture4d.app.compare.config import CompareConfig
 from capture4d.app.status.work_folders import changes, diff, made_anew, needs_tracking, status
 from capture4d.app.status.work_folders import plan as plan
 from capture4d.calibration.config import CalibrationConfig, RigCheckConfig
-from capture4d.captures.capture import Capture, read_capture
-from capture4d.captures.work_folder import WorkFolder, open_work
+from capture4d.captures.work_folder import AnyCapture, AnyWork, Place, opened_capture, opened_work, path_of
 from capture4d.runs.decisions import forget_decisions, take_over_decisions
 from capture4d.runs.run_log import logged_stage
 from capture4d.runs.stage import StageResult
@@ -46,10 +45,6 @@ __all__ = [
     "wrinkles_offsets", "wrinkles_train",
 ]  # fmt: skip
 
-Place: TypeAlias = str | Path
-AnyCapture: TypeAlias = Capture | Place
-AnyWork: TypeAlias = WorkFolder | Place
-
 
 @logged_stage("extract")
 def extract(
@@ -64,7 +59,7 @@ def extract(
     from capture4d.extraction.stage import run as stage
 
     config = ExtractionSettings(learn_colours=learn_colours)
-    return stage(_capture(capture), _path(work) / "garment", config, workers=workers, overwrite=overwrite)
+    return stage(opened_capture(capture), path_of(work) / "garment", config, workers=workers, overwrite=overwrite)
 
 
 @logged_stage("track")
@@ -80,7 +75,11 @@ def track(
     from capture4d.tracking.stage import run as stage
 
     return stage(
-        _capture(capture), _path(work) / "body", config or TrackingConfig(), workers=workers, overwrite=overwrite
+        opened_capture(capture),
+        path_of(work) / "body",
+        config or TrackingConfig(),
+        workers=workers,
+        overwrite=overwrite,
     )
 
 
@@ -101,9 +100,9 @@ def register(
     """
     from registration.stage import run as stage
 
-    folder = _path(work)
+    folder = path_of(work)
     return stage(
-        _capture(capture),
+        opened_capture(capture),
         folder / "garment",
         folder / "registration",
         config or RegistrationConfig(),
@@ -122,14 +121,14 @@ def report(
     Args:
         capture: the capture, if it is not where it was when it was registered.
     """
-    opened = _work(work)
+    opened = opened_work(work)
     if opened.is_animated:
         from capture4d.app.report.animation import run as animation_report
 
         return animation_report(opened, workers=workers, overwrite=overwrite)
     from capture4d.app.report.take import run as take_report
 
-    moved = None if capture is None else _capture(capture)
+    moved = None if capture is None else opened_capture(capture)
     return take_report(opened, capture=moved, workers=workers, overwrite=overwrite)
 
 
@@ -155,7 +154,7 @@ def run(
     Returns:
         The registration's result; its path is the page of the report, if that was drawn.
     """
-    opened, folder = _capture(capture), _path(work)
+    opened, folder = opened_capture(capture), path_of(work)
     tracked = tracked or needs_tracking(opened)
     if not tracked:
         _ = opened.poses  # what is wrong with it is said before the work, not after
@@ -176,7 +175,7 @@ def renew(work: AnyWork, what: Collection[str]) -> None:
     Raises:
         InputError: it decides no such thing.
     """
-    forget_decisions(_path(work), what)
+    forget_decisions(path_of(work), what)
 
 
 def take_over(work: AnyWork, like: AnyWork) -> None:
@@ -186,7 +185,7 @@ def take_over(work: AnyWork, like: AnyWork) -> None:
         work: folder in which nothing has been tracked and extracted yet.
         like: work folder of a take of the same person, in the same clothes.
     """
-    take_over_decisions(_path(work), _path(like))
+    take_over_decisions(path_of(work), path_of(like))
 
 
 @logged_stage("calibrate")
@@ -323,7 +322,7 @@ def fit(
     """
     from retarget.fit_stage import run as stage
 
-    opened = [_work(work) for work in works]
+    opened = [opened_work(work) for work in works]
     return stage(opened, Path(output), config or FitConfig(), device=device, workers=workers, overwrite=overwrite)
 
 
@@ -373,8 +372,8 @@ def wrinkles_maps(
     """
     from wrinkles.normal_maps.maps_stage import run as stage
 
-    lender = None if high_from is None else _work(high_from)
-    return stage(_work(work), config or PairConfig(), high_from=lender, workers=workers, overwrite=overwrite)
+    lender = None if high_from is None else opened_work(high_from)
+    return stage(opened_work(work), config or PairConfig(), high_from=lender, workers=workers, overwrite=overwrite)
 
 
 @logged_stage("wrinkles train")
@@ -395,7 +394,7 @@ def wrinkles_train(
     """
     from wrinkles.normal_maps.train_stage import run as stage
 
-    opened = [_work(work) for work in works]
+    opened = [opened_work(work) for work in works]
     return stage(
         opened, Path(output), config or wrinkle_config.PRESETS["small"],
         pairs=pairs, workers=workers, overwrite=overwrite,
@@ -409,7 +408,7 @@ def wrinkles_apply(
     """Make tangent-space normal maps with wrinkles for a registered or animated take: WORK/wrinkles/generated."""
     from wrinkles.normal_maps.apply_stage import run as stage
 
-    return stage(Path(model), _work(work), config or ApplyConfig(), workers=workers, overwrite=overwrite)
+    return stage(Path(model), opened_work(work), config or ApplyConfig(), workers=workers, overwrite=overwrite)
 
 
 @logged_stage("wrinkles offsets")
@@ -420,7 +419,7 @@ def wrinkles_offsets(
     from wrinkles.offset_images.model_files import OFFSETS
     from wrinkles.offset_images.stage import run as stage
 
-    opened = _work(work)
+    opened = opened_work(work)
     return stage(opened, opened.path / OFFSETS, config or OffsetConfig(), workers=workers, overwrite=overwrite)
 
 
@@ -443,19 +442,7 @@ def compare(
     from capture4d.app.compare.page import run as stage
 
     learned, config = _maybe(garment_model), config or CompareConfig()
-    return stage(_work(work), Path(model), config, garment_model=learned, workers=workers, overwrite=overwrite)
-
-
-def _capture(capture: AnyCapture) -> Capture:
-    return capture if isinstance(capture, Capture) else read_capture(capture)
-
-
-def _work(work: AnyWork) -> WorkFolder:
-    return work.now() if isinstance(work, WorkFolder) else open_work(work)
-
-
-def _path(work: AnyWork) -> Path:
-    return work.path if isinstance(work, WorkFolder) else Path(work)
+    return stage(opened_work(work), Path(model), config, garment_model=learned, workers=workers, overwrite=overwrite)
 
 
 def _maybe(place: Place | None) -> Path | None:

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -35,11 +35,17 @@ __all__ = [
     "ANIMATE",
     "REGISTER",
     "VERDICTS",
+    "AnyCapture",
+    "AnyWork",
+    "Place",
     "WorkFolder",
     "load_records",
     "load_registration",
     "load_tracking",
     "open_work",
+    "opened_capture",
+    "opened_work",
+    "path_of",
     "require_from_scans",
     "stack_vertices",
     "tracking_digest",
@@ -168,6 +174,28 @@ def open_work(path: str | Path) -> WorkFolder:
     path = Path(path)
     records = {file.parent.name: read_record(file) for file in sorted(path.glob("*/stage.json"))}
     return WorkFolder(path, records)
+
+
+# --- by path, or open already -------------------------------------------------------------------------------------
+
+Place: TypeAlias = str | Path
+AnyCapture: TypeAlias = Capture | Place
+AnyWork: TypeAlias = WorkFolder | Place
+
+
+def opened_capture(capture: AnyCapture) -> Capture:
+    """A capture, read if it is a path."""
+    return capture if isinstance(capture, Capture) else read_capture(capture)
+
+
+def opened_work(work: AnyWork) -> WorkFolder:
+    """A work folder as it is now."""
+    return work.now() if isinstance(work, WorkFolder) else open_work(work)
+
+
+def path_of(work: AnyWork) -> Path:
+    """Where a work folder is, or will be."""
+    return work.path if isinstance(work, WorkFolder) else Path(work)
 
 
 # --- what stages leave -------------------------------------------------------------------------------------------

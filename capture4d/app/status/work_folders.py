@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
-from capture4d.captures.capture import Capture, read_capture
-from capture4d.captures.work_folder import WorkFolder, open_work
+from capture4d.captures.capture import Capture
+from capture4d.captures.work_folder import AnyCapture, AnyWork, Place, opened_capture, opened_work, path_of
 from capture4d.runs.changes import StageChanges
 from capture4d.tracking.config import TrackingConfig
 from registration.config import RegistrationConfig
@@ -22,10 +22,6 @@ if TYPE_CHECKING:
     from capture4d.extraction.stage import ExtractionSettings
 
 __all__ = ["changes", "diff", "made_anew", "needs_tracking", "plan", "plan_stage", "status"]
-
-Place: TypeAlias = str | Path
-AnyCapture: TypeAlias = Capture | Place
-AnyWork: TypeAlias = WorkFolder | Place
 
 
 def changes(
@@ -45,7 +41,7 @@ def changes(
     from capture4d.tracking.stage import changes as track_changes
     from registration.stage import changes as registration
 
-    opened, folder = _capture(capture), _path(work)
+    opened, folder = opened_capture(capture), path_of(work)
     found = [extraction(opened, folder / "garment", ExtractionSettings())]
     tracked = tracked or needs_tracking(opened)
     if tracked:
@@ -78,10 +74,10 @@ def plan(
     """
     from capture4d.app.status.plan import plan_stages, renewed
 
-    opened = _capture(capture)
-    found = renewed(changes(opened, work, config, tracking=tracking, tracked=tracked), opened, _path(work), renew)
+    opened = opened_capture(capture)
+    found = renewed(changes(opened, work, config, tracking=tracking, tracked=tracked), opened, path_of(work), renew)
     anew = made_anew(found) if overwrite else ()
-    return plan_stages(opened, _path(work), found, anew=anew, report=True, workers=workers)
+    return plan_stages(opened, path_of(work), found, anew=anew, report=True, workers=workers)
 
 
 def plan_stage(
@@ -101,7 +97,7 @@ def plan_stage(
     from capture4d.tracking.stage import changes as track_changes
     from registration.stage import changes as registration
 
-    opened, folder = _capture(capture), _path(work)
+    opened, folder = opened_capture(capture), path_of(work)
     match settings:
         case ExtractionSettings():
             found = extraction(opened, folder / "garment", settings)
@@ -118,7 +114,7 @@ def status(work: AnyWork) -> WorkStatus:
     """Tell what is done in a work folder, what is running, stale or damaged, and why; which frames are flagged."""
     from capture4d.app.status.survey import survey
 
-    return survey(_path(work))
+    return survey(path_of(work))
 
 
 def diff(first: AnyWork, second: AnyWork, page: Place | None = None, *, overwrite: bool = False) -> WorkDiff:
@@ -132,7 +128,7 @@ def diff(first: AnyWork, second: AnyWork, page: Place | None = None, *, overwrit
     from capture4d.app.differences.page import write_page
     from capture4d.app.differences.work_diff import diff_works
 
-    found = diff_works(_work(first), _work(second))
+    found = diff_works(opened_work(first), opened_work(second))
     if page is not None:
         write_page(found, Path(page), overwrite=overwrite)
     return found
@@ -147,15 +143,3 @@ def made_anew(found: Sequence[StageChanges]) -> tuple[str, ...]:
 def needs_tracking(capture: Capture) -> bool:
     """Whether the template is bound to a body of which the capture has no poses."""
     return capture.template.skin_weights is not None and not (capture.path / "poses.npz").is_file()
-
-
-def _capture(capture: AnyCapture) -> Capture:
-    return capture if isinstance(capture, Capture) else read_capture(capture)
-
-
-def _work(work: AnyWork) -> WorkFolder:
-    return work.now() if isinstance(work, WorkFolder) else open_work(work)
-
-
-def _path(work: AnyWork) -> Path:
-    return work.path if isinstance(work, WorkFolder) else Path(work)
