@@ -144,7 +144,7 @@ class Run(DryRunOptions, DecidingOptions, GradedOptions, MeshOptions):
         taken = self.taken(self.capture)
         if self.dry_run:
             return self.told(pipeline.plan(
-                taken, self.output, self.config, tracking=self.tracking, tracked=self.track,
+                taken, self.output, self.config, tracking=self.tracking, tracked=self.tracked,
                 renew=self.to_renew, workers=self.workers, overwrite=self.overwrite,
             ))  # fmt: skip
         self.renewed(self.output)
