@@ -46,6 +46,8 @@ EXAMPLES: Mapping[str, Sequence[str]] = {
     "register": ("register capture --output work", "register capture --output work --tracked --preset paper"),
     "run": ("run capture --output work", "run capture --output work --workers 8 --max-failed 2 --quiet"),
     "report": ("report work", "report work --fail-above fit_mean_mm=1.0 --fail-above frames_failed=0"),
+    "status": ("status work",),
+    "diff": ("diff before after", "diff before after --fail-if-worse fit_mean_mm=5"),
     "fit": ("fit work", "fit walk run jump --output shirt"),
     "animate": ("animate work --poses motion.bvh --output dance --beta 1.5 2.0",),
     "wrinkles maps": ("wrinkles maps work",),
