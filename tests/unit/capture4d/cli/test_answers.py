@@ -3,6 +3,7 @@
 import json
 import re
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -19,9 +20,7 @@ from tests.command_line import run
 GOES_ON = "the same command goes on"
 BEGINS_ANEW = "without --overwrite the same command goes on, with it it begins anew"
 FULL = OSError(28, "No space left on device", "out/x.npz")
-DIED = WorkerDied(
-    "extract: a worker process was killed; finished frames are kept, the same command goes on (with fewer)"
-)
+DIED = WorkerDied("fit: a worker process was killed; finished frames are kept, the same command goes on (with fewer)")
 
 
 @pytest.mark.parametrize(
@@ -33,8 +32,8 @@ def test_what_the_same_command_would_do(
     def fail(*_: object, **__: object) -> None:
         raise error
 
-    monkeypatch.setattr(pipeline, "extract", fail)
-    command = ("extract", "take", "--output", tmp_path / "work")
+    monkeypatch.setattr(pipeline, "fit", fail)
+    command = ("fit", "take", "--output", tmp_path / "work")
     for more, said in (((), GOES_ON), (("--overwrite",), BEGINS_ANEW)):
         assert run(*command, *more) == code
         (line,) = capsys.readouterr().err.splitlines()
@@ -45,16 +44,17 @@ def test_what_the_same_command_would_do(
 
 @pytest.fixture
 def stopping(monkeypatch: pytest.MonkeyPatch) -> dict[str, BaseException | None]:
-    """An extraction that begins, and then raises what is put here."""
+    """A stage that begins, says something, and then raises what is put here."""
     fault: dict[str, BaseException | None] = {"raised": None}
 
-    def extract(capture: Path, work: Path, **_: object) -> StageResult:
-        open_stage(work / "garment", name="extract", schema=1, config={}, upstream={})
+    def fit(works: Sequence[Path], output: Path, *_: object, **__: object) -> StageResult:
+        open_stage(output, name="fit", schema=1, config={}, upstream={})
+        print("capture4d: one take teaches little", file=sys.stderr)
         if fault["raised"] is not None:
             raise fault["raised"]
-        return StageResult(work / "garment", "digest", 3, {6: "no cloth"})
+        return StageResult(output, "digest")
 
-    monkeypatch.setattr(pipeline, "extract", extract)
+    monkeypatch.setattr(pipeline, "fit", fit)
     return fault
 
 
@@ -65,24 +65,24 @@ def test_the_log_has_what_was_said_and_the_exit_code(
     error: BaseException | None, code: int, stopping: dict[str, BaseException | None], tmp_path: Path
 ):
     stopping["raised"] = error
-    assert run("extract", "take", "--output", tmp_path / "work") == code
+    assert run("fit", "take", "--output", tmp_path / "work") == code
     lines = [json.loads(line) for line in (tmp_path / "work" / LOG).read_text().splitlines()]
-    events = [line["event"] for line in lines]
-    assert lines[0]["command"] == ["capture4d", "extract", "take", "--output", str(tmp_path / "work")]
-    assert lines[0]["settings"]["learn_colours"] is False
+    assert lines[0]["command"] == ["capture4d", "fit", "take", "--output", str(tmp_path / "work")]
+    assert lines[0]["settings"]["config"]["regressor"] == "all"
+    assert lines[1]["text"] == "one take teaches little"
     assert lines[-1]["code"] == code
+    events = [line["event"] for line in lines]
     if error is None:
         assert events == ["begins", "said", "ends"]
-        assert lines[1]["text"] == "no garment in 1 of 3 frames: 6; frame 6: no cloth"
     else:
-        assert events == ["begins", "said", "fault", "ends"]
-        assert lines[2]["kind"] == type(error).__name__
+        assert events == ["begins", "said", "said", "fault", "ends"]
+        assert lines[3]["kind"] == type(error).__name__
 
 
 def test_a_bug_is_in_the_log_and_keeps_its_traceback(stopping: dict[str, BaseException | None], tmp_path: Path):
     stopping["raised"] = ZeroDivisionError("ours")
     with pytest.raises(ZeroDivisionError):
-        main(["extract", "take", "--output", str(tmp_path / "work")])
+        main(["fit", "take", "--output", str(tmp_path / "work")])
     *_, fault, ends = [json.loads(line) for line in (tmp_path / "work" / LOG).read_text().splitlines()]
     assert re.search(r"ZeroDivisionError: ours\n$", fault["traceback"])
     assert ends["code"] == 1
