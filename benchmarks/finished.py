@@ -34,7 +34,7 @@ from capture4d.files.atomic import write_json
 from capture4d.files.records import save_body, save_garment
 from capture4d.geometry.mesh import boundary_loops
 from capture4d.runs.growing import GrowingStage
-from capture4d.runs.made import FileState, Ledger, Made
+from capture4d.runs.made import FileState, Ledger, Made, digest_of
 from capture4d.runs.stage import read_record
 from capture4d.tracking import first_pass, second_pass
 from capture4d.tracking import stage as tracking
@@ -147,7 +147,13 @@ def _make_up(capture: Capture, work: Path) -> None:
     pipeline.extract(capture, work)
     pipeline.track(capture, work)
     pipeline.register(capture, work, tracked=True)
-    upstream = {"registration": read_record(work / "registration" / "stage.json")["digest"]}
+    registered = read_record(work / "registration" / "stage.json")
+    said = [capture.name, capture.entries("fps", "units", "garment_colour", "boundary_colours")]
+    upstream = {
+        "registration": registered["digest"],
+        "settings of the registration": digest_of(registered["config"]),
+        "capture.json": digest_of(said),
+    }
     record = {"stage": "report", "schema": report.SCHEMA, "config": asdict(report.DEFAULT), "upstream": upstream}
     for name in ("index.html", "metrics.json"):
         write_json(work / "report" / name, {"metrics": []})

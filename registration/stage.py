@@ -193,7 +193,7 @@ class _Chain:
     """Whether a frame starts from the one before; else it matters only that there is one."""
 
     def path(self, frame_id: int) -> Path:
-        return self.ledger.folder / "frames" / f"{frame_id:06d}.npz"
+        return self.ledger.folder.joinpath("frames", f"{frame_id:06d}.npz")
 
     def inputs(self, position: int, before: int | None) -> dict[str, str]:
         """What the frame at a position is made from, if it can start from the one at another."""
@@ -241,7 +241,7 @@ def _chain(
     read = asdict(config)
     for cut in ("segment", "keyframe_bend_deg"):  # what they decide shows in where frames start from
         del read["sequence"][cut]
-    found = [garments.of(garments.folder / "frames" / f"{frame_id:06d}.npz") for frame_id in frame_ids]
+    found = [garments.of(garments.folder.joinpath("frames", f"{frame_id:06d}.npz")) for frame_id in frame_ids]
     return _Chain(
         ledger,
         frame_ids,

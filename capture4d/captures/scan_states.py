@@ -47,7 +47,7 @@ def scan_looked_at(capture: Capture, frame_id: int) -> Iterator[list[FileState]]
             looked += [own, *(file_state(each, name) for name, each in others)]
 
 
-def as_it_is_now(capture: Capture, frame_id: int, before: Sequence[FileState]) -> tuple[FileState, ...]:
+def as_it_is_now(capture: Capture, frame_id: int, before: tuple[FileState, ...]) -> tuple[FileState, ...]:
     """The files that were read of a scan as they are now; itself alone if it was never read, or is another file."""
     try:
         path = scan_path(capture, frame_id)
@@ -55,6 +55,8 @@ def as_it_is_now(capture: Capture, frame_id: int, before: Sequence[FileState]) -
         return ()
     if not before or before[0].name != path.name:
         return (file_state(path, path.name),)
+    if all(is_as(path if at == 0 else path.parent / each.name, each) for at, each in enumerate(before)):
+        return before
     places = [path, *(path.parent / each.name for each in before[1:])]
     return tuple(
         each if is_as(place, each) else file_state(place, each.name) for place, each in zip(places, before, strict=True)
@@ -77,18 +79,21 @@ def stands_with_scan(ledger: Ledger, path: Path, capture: Capture, frame_id: int
     if made is None or made.said.get(DAMAGED) or {**made.inputs, "scan": ""} != {**inputs, "scan": ""}:
         return False
     files = as_it_is_now(capture, frame_id, made.files)
-    if not files or scan_digest(files) != made.inputs["scan"] or ledger.sound(path) is None:
+    if files is made.files:
+        return ledger.is_whole(path, made)
+    if not files or scan_digest(files) != made.inputs["scan"] or not ledger.is_whole(path, made):
         return False
-    if files != made.files:  # the same content at another time
-        ledger.note(path, replace(made, files=files))
+    ledger.note(path, replace(made, files=files))  # the same content at another time
     return True
 
 
 def replaced_scan(ledger: Ledger, path: Path, capture: Capture, frame_id: int) -> bool:
     """Whether a file of a stage was made from another scan than the frame's is now."""
     made = ledger.of(path)
-    files = () if made is None else as_it_is_now(capture, frame_id, made.files)
-    return made is not None and bool(files) and scan_digest(files) != made.inputs.get("scan")
+    if made is None:
+        return False
+    files = as_it_is_now(capture, frame_id, made.files)
+    return files is not made.files and bool(files) and scan_digest(files) != made.inputs.get("scan")
 
 
 def require_same_take(folder: Path, capture: Capture) -> None:

@@ -197,7 +197,9 @@ def require_from_scans(folder: Path, name: str, command: str, capture: Capture) 
     words = frame_changes(sorted({*capture.frame_ids, *made_for}), made_for)  # more than are asked for will do
     said = record.get("description", {})
     words += description_changes(capture.entries(*said), said)
-    paths = {frame_id: folder / "frames" / f"{frame_id:06d}.npz" for frame_id in {*capture.frame_ids} & {*made_for}}
+    paths = {
+        frame_id: folder.joinpath("frames", f"{frame_id:06d}.npz") for frame_id in {*capture.frame_ids} & {*made_for}
+    }
     replaced = sorted(each for each, path in paths.items() if replaced_scan(ledger, path, capture, each))
     if replaced:
         words.append(counted(replaced, "replaced"))

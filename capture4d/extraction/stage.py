@@ -155,7 +155,7 @@ def _inputs(capture: Capture, colours: KnownColours) -> dict[str, str]:
 
 def _pending(capture: Capture, ledger: Ledger, inputs: Mapping[str, str]) -> Pending:
     """Frames that are to be extracted."""
-    paths = {frame_id: ledger.folder / "frames" / f"{frame_id:06d}.npz" for frame_id in capture.frame_ids}
+    paths = {frame_id: ledger.folder.joinpath("frames", f"{frame_id:06d}.npz") for frame_id in capture.frame_ids}
     frames = [each for each, path in paths.items() if not stands_with_scan(ledger, path, capture, each, inputs)]
     replaced = [each for each in frames if replaced_scan(ledger, paths[each], capture, each)]
     return Pending(tuple(frames), replaced=tuple(replaced))

@@ -10,6 +10,7 @@ not renew every other one; `--renew` finds it anew.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -25,7 +26,7 @@ from capture4d.runs.changes import (
     setting_changes,
 )
 from capture4d.runs.frame_lists import counted, expanded, listed
-from capture4d.runs.made import FileState, Ledger, Made, joined, make
+from capture4d.runs.made import FileState, Ledger, Made, make
 from capture4d.runs.stage import Stage, StageResult, earlier_record, opened_record, settings_of, unchanged_settings
 
 __all__ = ["GrowingStage", "Pending", "Reads", "frames_of", "open_growing_stage", "stage_changes"]
@@ -99,13 +100,7 @@ class GrowingStage(Stage):
 
     def digest_of_all(self, paths: Iterable[Path]) -> str:
         """Digest over the names and contents of files that were all made."""
-        parts = {}
-        for path in paths:
-            made = self.ledger.of(path)
-            if made is None:
-                raise FileNotFoundError(path)
-            parts[path.relative_to(self.path).as_posix()] = made.digest
-        return joined(parts.items())
+        return self.ledger.digest_of(paths)
 
     def finish_growing(
         self, paths: Iterable[Path], *, frames: int, failed: Mapping[int, str] | None = None
@@ -213,12 +208,14 @@ def frames_of(record: Mapping[str, Any]) -> tuple[int, ...] | None:
 def _drop_frames(stage: GrowingStage, kept: set[int]) -> None:
     """Delete the files of frames that the take no longer has."""
 
-    def stays(path: Path) -> bool:
-        return not path.stem.isdecimal() or int(path.stem) in kept
+    def stays(name: str) -> bool:
+        number = name.partition(".")[0]
+        return not number.isdecimal() or int(number) in kept
 
     for each in stage.path.iterdir():
         if each.is_dir() and not each.is_symlink():
-            for path in each.iterdir():
-                if not stays(path):
-                    path.unlink(missing_ok=True)
+            with os.scandir(each) as entries:
+                gone = [entry.path for entry in entries if not stays(entry.name)]
+            for path in gone:
+                os.unlink(path)
     stage.ledger.forget(stays)

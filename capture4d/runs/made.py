@@ -75,20 +75,24 @@ class Ledger:
 
     folder: Path
     _made: dict[str, Made]
+    _is_settled: bool = False
+    """The file of the stage says the same."""
 
     @staticmethod
     def read(folder: Path) -> Ledger:
         """What is known, without writing anything."""
-        made: dict[str, Made] = {}
-        for path in (folder / MADE, *sorted((folder / JOURNALS).glob("*.jsonl"))):
+        made = dict(_settled(folder / MADE))
+        journals = sorted((folder / JOURNALS).glob("*.jsonl"))
+        for path in journals:
             made.update(_lines(path))
-        return Ledger(folder, {place: each for place, each in made.items() if each is not _GONE})
+        known = {place: each for place, each in made.items() if each is not _GONE} if journals else made
+        return Ledger(folder, known, not journals)
 
     @staticmethod
     def open(folder: Path) -> Ledger:
         """The same, the notes of killed runs merged into one file."""
         ledger = Ledger.read(folder)
-        if any((folder / JOURNALS).glob("*.jsonl")):
+        if not ledger._is_settled:
             ledger.settle()
         return ledger
 
@@ -107,34 +111,49 @@ class Ledger:
     def stands(self, path: Path, inputs: Mapping[str, str]) -> bool:
         """Whether a file is there, whole, and was made from the same."""
         made = self.of(path)
-        return made is not None and made.inputs == inputs and self._is_whole(path, made)
+        return made is not None and made.inputs == inputs and self.is_whole(path, made)
 
     def sound(self, path: Path) -> Made | None:
         """What is known of a file that is there as it was recorded."""
         made = self.of(path)
-        return made if made is not None and self._is_whole(path, made) else None
+        return made if made is not None and self.is_whole(path, made) else None
+
+    def digest_of(self, paths: Iterable[Path]) -> str:
+        """One digest over the names and contents of files that were all made."""
+        places = [self._place(path) for path in paths]
+        return joined((place, self._made[place].digest) for place in places)
 
     def note(self, path: Path, made: Made) -> None:
         """Know of a file that was made by this process or another."""
         self._made[self._place(path)] = made
+        self._is_settled = False
 
-    def forget(self, keep: Callable[[Path], bool]) -> None:
-        """Know no longer of files that are not to be kept."""
-        self._made = {place: made for place, made in self._made.items() if keep(self.folder / place)}
+    def forget(self, keep: Callable[[str], bool]) -> None:
+        """Know no longer of files that are not to be kept, by their names."""
+        kept = {place: made for place, made in self._made.items() if keep(place.rpartition("/")[2])}
+        self._is_settled &= len(kept) == len(self._made)
+        self._made = kept
 
     def settle(self) -> None:
         """Write what is known into one file; the notes that it was known from go."""
+        if self._is_settled:
+            return
         lines = (_line(place, made) for place, made in self._made.items())
         write_bytes(self.folder / MADE, "".join(lines).encode())
         for path in (self.folder / JOURNALS).glob("*.jsonl"):
             path.unlink(missing_ok=True)
         with contextlib.suppress(OSError):
             (self.folder / JOURNALS).rmdir()
+        self._is_settled = True
 
     def _place(self, path: Path) -> str:
-        return path.relative_to(self.folder).as_posix()
+        """A file's place in the folder; pathlib's own way takes a second for all that are asked of a long take."""
+        place, folder = str(path), f"{self.folder}{os.sep}"
+        assert place.startswith(folder), place
+        return place[len(folder) :] if os.sep == "/" else place[len(folder) :].replace(os.sep, "/")
 
-    def _is_whole(self, path: Path, made: Made) -> bool:
+    def is_whole(self, path: Path, made: Made) -> bool:
+        """Whether a file is there as it was recorded."""
         try:
             found = os.stat(path)
         except OSError:
@@ -213,6 +232,23 @@ def _line(place: str, made: Made) -> str:
 
 def _gone(place: str) -> str:
     return json.dumps({"path": place}) + "\n"
+
+
+def _settled(path: Path) -> Mapping[str, Made]:
+    """What a stage's file says; the stages of one run do not read it twice."""
+    try:
+        found = os.stat(path)
+    except FileNotFoundError:
+        return {}
+    if _is_fresh(found):
+        return dict(_lines(path))
+    return _remembered_lines(path, found.st_size, found.st_mtime_ns)
+
+
+@lru_cache(maxsize=16)
+def _remembered_lines(path: Path, size: int, time_ns: int) -> Mapping[str, Made]:
+    """That of a file of this size and time."""
+    return dict(_lines(path))
 
 
 def _lines(path: Path) -> Iterator[tuple[str, Made]]:

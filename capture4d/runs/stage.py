@@ -90,7 +90,7 @@ class Stage:
 
     def frame_path(self, frame_id: int, suffix: str = ".npz", *, folder: str = "frames") -> Path:
         """Where a frame's file goes: `<stage>/<folder>/000123<suffix>`."""
-        return self.path / folder / f"{frame_id:06d}{suffix}"
+        return self.path.joinpath(folder, f"{frame_id:06d}{suffix}")
 
     def pending(self, frame_ids: Iterable[int], suffix: str = ".npz", *, folder: str = "frames") -> list[int]:
         """The frames that have no valid file yet, in the order given."""

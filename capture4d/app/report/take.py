@@ -25,11 +25,12 @@ from capture4d.captures.truth import TruthModel, read_truth_model, read_truth_ve
 from capture4d.captures.work_folder import VERDICTS, WorkFolder
 from capture4d.errors import InputError
 from capture4d.files.atomic import write_bytes, write_json, write_json_lines
-from capture4d.runs.stage import StageResult, open_stage, read_record, require_complete, result_of
+from capture4d.runs.made import digest_of
+from capture4d.runs.stage import StageResult, complete_record, open_stage, read_record, result_of
 from capture4d.runs.workers import run_jobs, shared
 from capture4d.settings import Count, settings
 
-__all__ = ["ReportConfig", "is_current", "run", "spread"]
+__all__ = ["ReportConfig", "is_current", "run", "shown_from", "spread"]
 
 SCHEMA = 4
 FIT, CORRESPONDENCE = "fit error", "correspondence error"
@@ -70,17 +71,16 @@ def run(
     folder = work.path / "report"
     place = work.capture_path if capture is None else capture.path
     command = f"capture4d register {place} --output {work.path}"
-    upstream = {"registration": require_complete(work.path / "registration", "register", command)}
-    compared = comparison_digest(work.path)
-    if compared is not None:
-        upstream["compare"] = compared
+    registered = complete_record(work.path / "registration", "register", command)
+    opened = capture or read_capture(place)
+    upstream = shown_from(work.path, opened, registered)
     current = {"schema": SCHEMA, "config": asdict(config), "upstream": upstream}
     if not overwrite and is_current(folder, current):
         return result_of(folder, folder / "index.html")
     stale = (folder / "stage.json").exists()
     stage = open_stage(folder, name="report", schema=SCHEMA, config=config, upstream=upstream, overwrite=stale)
     frame_ids = tuple(work.registered.frame_ids.tolist())  # those that were asked for
-    scene = _Scene(work, replace(capture or read_capture(place), frame_ids=frame_ids))
+    scene = _Scene(work, replace(opened, frame_ids=frame_ids))
     records = [dict(record) for record in work.records]
     _measure_truth(scene, records, config, workers)
     tracked = tracking(scene.capture, work.path)
@@ -111,6 +111,22 @@ def run(
     write_bytes(folder / "index.html", page.encode())
     # the report holds times, which differ between equal runs; nothing is made from it
     return stage.finish([], output=folder / "index.html")
+
+
+def shown_from(work: Path, capture: Capture, registered: Mapping[str, Any]) -> dict[str, str]:
+    """Digests of what a report shows, by name.
+
+    Args:
+        registered: stage.json of the registration.
+    """
+    said = [capture.name, capture.entries("fps", "units", "garment_colour", "boundary_colours")]
+    compared = comparison_digest(work)
+    return {
+        "registration": registered["digest"],
+        "settings of the registration": digest_of(registered["config"]),
+        "capture.json": digest_of(said),
+        **({} if compared is None else {"compare": compared}),
+    }
 
 
 # --- frames ------------------------------------------------------------------------------------------------------

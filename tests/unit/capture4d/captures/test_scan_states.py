@@ -41,10 +41,10 @@ def age(path: Path, seconds: int = 100) -> None:
     os.utime(path, ns=(found.st_atime_ns, found.st_mtime_ns - seconds * 10**9))
 
 
-def look(capture: Capture, frame_id: int) -> list[FileState]:
+def look(capture: Capture, frame_id: int) -> tuple[FileState, ...]:
     with scan_looked_at(capture, frame_id) as looked:
         read_scan(capture, frame_id)
-    return looked
+    return tuple(looked)
 
 
 def test_what_a_scan_names_belongs_to_it_and_to_no_other(textured: Capture):
@@ -54,7 +54,7 @@ def test_what_a_scan_names_belongs_to_it_and_to_no_other(textured: Capture):
     picture = textured.path / "scans" / "textures" / "skin.png"
     Image.fromarray(np.full((4, 4, 3), 91, np.uint8)).save(picture)
     assert scan_digest(as_it_is_now(textured, 1, first)) != scan_digest(first)
-    assert as_it_is_now(textured, 2, second) == tuple(second)
+    assert as_it_is_now(textured, 2, second) is second
     picture.unlink()
     gone = as_it_is_now(textured, 1, first)
     assert [each.digest for each in gone][2] == "absent"
@@ -68,7 +68,7 @@ def test_a_texture_that_is_missing_is_missed(textured: Capture):
         read_scan(textured, 1)
     assert [(each.name, each.digest == "absent") for each in looked][-1] == ("textures/skin.png", True)
     picture.write_bytes(data)
-    assert scan_digest(as_it_is_now(textured, 1, looked)) != scan_digest(looked)
+    assert scan_digest(as_it_is_now(textured, 1, tuple(looked))) != scan_digest(looked)
 
 
 def test_names_do_not_count_but_the_kind_of_file_does(textured: Capture):
@@ -84,7 +84,7 @@ def test_a_scan_is_hashed_again_only_if_size_or_time_differ(textured: Capture, m
     read: list[Path] = []
     plain = made_module._hashed
     monkeypatch.setattr(made_module, "_hashed", lambda path: read.append(path) or plain(path))
-    assert as_it_is_now(textured, 2, before) == tuple(before)
+    assert as_it_is_now(textured, 2, before) is before
     assert not read
     age(textured.path / "scans" / "2.ply", 50)
     again = as_it_is_now(textured, 2, before)
