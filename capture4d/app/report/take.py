@@ -34,7 +34,7 @@ from capture4d.runs.stage import StageResult, complete_record, open_stage, read_
 from capture4d.runs.workers import run_jobs, shared
 from capture4d.settings import Count, Whole, settings
 
-__all__ = ["ReportConfig", "is_current", "run", "spread"]
+__all__ = ["ReportConfig", "is_current", "run", "shown_from", "spread"]
 
 SCHEMA = 4
 FILM_WIDTH = 360
@@ -81,15 +81,7 @@ def run(
     command = f"capture4d register {place} --output {work.path}"
     registered = complete_record(work.path / "registration", "register", command)
     opened = capture or read_capture(place)
-    said = [opened.name, opened.entries("fps", "units", "garment_colour", "boundary_colours")]
-    upstream = {
-        "registration": registered["digest"],
-        "settings of the registration": digest_of(registered["config"]),
-        "capture.json": digest_of(said),
-    }
-    compared = comparison_digest(work.path)
-    if compared is not None:
-        upstream["compare"] = compared
+    upstream = shown_from(work.path, opened, registered)
     current = {"schema": SCHEMA, "config": asdict(config), "upstream": upstream}
     if not overwrite and is_current(folder, current):
         return result_of(folder, folder / "index.html")
@@ -129,6 +121,22 @@ def run(
     write_bytes(folder / "index.html", page.encode())
     # the report holds times, which differ between equal runs; nothing is made from it
     return stage.finish([], output=folder / "index.html")
+
+
+def shown_from(work: Path, capture: Capture, registered: Mapping[str, Any]) -> dict[str, str]:
+    """Digests of what a report shows, by name.
+
+    Args:
+        registered: stage.json of the registration.
+    """
+    said = [capture.name, capture.entries("fps", "units", "garment_colour", "boundary_colours")]
+    compared = comparison_digest(work)
+    return {
+        "registration": registered["digest"],
+        "settings of the registration": digest_of(registered["config"]),
+        "capture.json": digest_of(said),
+        **({} if compared is None else {"compare": compared}),
+    }
 
 
 # --- frames ------------------------------------------------------------------------------------------------------

@@ -16,6 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from capture4d.app.status.staleness import report_changes
 from capture4d.app.status.survey import logged_costs
 from capture4d.captures.capture import Capture, scan_path
 from capture4d.errors import InputError
@@ -133,7 +134,7 @@ def plan_stages(
         refused = refused or each.state == "refuse"
         stages.append(each)
     if report:
-        stages.append(_planned_report(work, stages, costs, refused))
+        stages.append(_planned_report(capture, work, stages, costs, refused))
     return Plan(work, tuple(stages), workers, _free(work))
 
 
@@ -240,10 +241,16 @@ def _missing(work: Path, changes: StageChanges) -> str | None:
 
 
 def _planned_report(
-    work: Path, before: Sequence[StagePlan], costs: Mapping[str, tuple[float, float]], refused: bool
+    capture: Capture, work: Path, before: Sequence[StagePlan], costs: Mapping[str, tuple[float, float]], refused: bool
 ) -> StagePlan:
     done = [stage for stage in before if stage.to_do or stage.perhaps]
-    why = "a stage before it refuses" if refused else "what it shows is done again" if done else _stale_report(work)
+    why = (
+        "a stage before it refuses"
+        if refused
+        else "what it shows is done again"
+        if done
+        else _stale_report(capture, work)
+    )
     state: Literal["do", "nothing", "refuse"] = "refuse" if refused else "do" if why else "nothing"
     cpu_s = costs["report"][1] if costs.get("report", (0.0, 0.0))[1] else REPORT_S
     spent = cpu_s if state == "do" else 0.0
@@ -255,14 +262,13 @@ def _planned_report(
     )
 
 
-def _stale_report(work: Path) -> str:
+def _stale_report(capture: Capture, work: Path) -> str:
     """Why a report has to be drawn; empty if it has not."""
-    report, registration = work / "report" / "stage.json", work / "registration" / "stage.json"
-    if not report.is_file():
-        return "never drawn"
-    made_from = read_record(report).get("upstream", {}).get("registration")
-    current = registration.is_file() and made_from == read_record(registration).get("digest")
-    return "" if current else "the registration has changed"
+    paths = {folder: work / folder / "stage.json" for folder in ("report", "registration")}
+    records = {folder: read_record(path) for folder, path in paths.items() if path.is_file()}
+    if records.get("report", {}).get("status") != "complete":
+        return "never drawn" if "report" not in records else "was stopped"
+    return ", ".join(report_changes(work, capture, records))
 
 
 # --- costs -------------------------------------------------------------------------------------------------------

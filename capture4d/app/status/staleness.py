@@ -8,18 +8,20 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from capture4d.app.report.take import SCHEMA as REPORT_SCHEMA
+from capture4d.app.report.take import shown_from
 from capture4d.captures.capture import Capture
 from capture4d.captures.work_folder import REGISTER
 from capture4d.errors import InputError
 from capture4d.extraction.stage import ExtractionSettings
 from capture4d.extraction.stage import changes as extraction_changes
-from capture4d.runs.changes import StageChanges
+from capture4d.runs.changes import StageChanges, input_changes
 from capture4d.tracking.config import TrackingConfig
 from capture4d.tracking.stage import changes as tracking_changes
 from registration.config import RegistrationConfig
 from registration.stage import changes as registration_changes
 
-__all__ = ["linked", "made_from", "rebuilt", "take_changes"]
+__all__ = ["linked", "made_from", "rebuilt", "report_changes", "take_changes"]
 
 Settings = TypeVar("Settings")
 
@@ -34,13 +36,15 @@ MADE_FROM = {
 """Digests in a stage's record, by name, and the folders of the stages that they are of."""
 
 
-def take_changes(capture: Capture, work: Path, records: Mapping[str, Mapping[str, Any]]) -> list[StageChanges | str]:
+def take_changes(
+    capture: Capture, work: Path, records: Mapping[str, Mapping[str, Any]]
+) -> list[StageChanges | list[str]]:
     """What the stages of a take that have been run would do again, each with its own settings; or why nobody can tell.
 
     Args:
         records: stage.json of each folder.
     """
-    found: list[StageChanges | str] = []
+    found: list[StageChanges | list[str]] = []
     for folder in ("garment", "body", "registration"):
         record = records.get(folder, {})
         if record.get("stage") not in ("extract", "track", REGISTER):
@@ -48,7 +52,7 @@ def take_changes(capture: Capture, work: Path, records: Mapping[str, Mapping[str
         try:
             changes = _changes(capture, work, folder, record)
         except InputError as error:
-            found.append(str(error))
+            found.append([str(error)])
         else:
             before = [each for each in found if isinstance(each, StageChanges) and not each.settings]
             found.append(changes.after(before) if folder == "registration" else changes)
@@ -83,6 +87,16 @@ def linked(record: Mapping[str, Any], records: Mapping[str, Mapping[str, Any]], 
         elif now.get("digest") != digest:
             words.append(f"{folder} has changed")
     return words
+
+
+def report_changes(work: Path, capture: Capture, records: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """What a report shows and is another by now."""
+    report, registered = records["report"], records.get("registration", {})
+    if registered.get("status") != "complete":
+        return [f"registration is {'not finished' if registered else 'gone'}"]
+    now, before = shown_from(work, capture, registered), report.get("upstream", {})
+    words = input_changes(now, before)
+    return words if words or report.get("schema") == REPORT_SCHEMA else ["drawn by another version of capture4d"]
 
 
 def rebuilt(kind: type[Settings], said: Mapping[str, Any]) -> Settings:

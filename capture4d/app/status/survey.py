@@ -15,7 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
-from capture4d.app.status.staleness import linked, made_from, take_changes
+from capture4d.app.status.staleness import linked, made_from, report_changes, take_changes
 from capture4d.captures.capture import read_capture
 from capture4d.captures.work_folder import ANIMATE, REGISTER, load_records
 from capture4d.errors import InputError
@@ -147,7 +147,7 @@ def _records(work: Path) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
 
 def _take(
     work: Path, records: Mapping[str, Mapping[str, Any]]
-) -> tuple[Path | None, str, dict[str, StageChanges | str], list[str]]:
+) -> tuple[Path | None, str, dict[str, StageChanges | list[str]], list[str]]:
     """Where the capture lies, what the take is called, what has changed since its stages were run, and what cannot be
     told."""
     if records.get("registration", {}).get("stage", REGISTER) != REGISTER or not {*records} & {"garment", "body"}:
@@ -170,14 +170,17 @@ def _take(
     except InputError as error:
         return place, work.resolve().name, {}, [f"The capture cannot be read: {error}"]
     done = [folder for folder in ("garment", "body", "registration") if folder in records]
-    return place, capture.name, dict(zip(done, take_changes(capture, work, records), strict=True)), []
+    changes: dict[str, StageChanges | list[str]] = dict(zip(done, take_changes(capture, work, records), strict=True))
+    if "report" in records:
+        changes["report"] = report_changes(work, capture, records)
+    return place, capture.name, changes, []
 
 
 def _stage(
     work: Path,
     folder: str,
     records: Mapping[str, Mapping[str, Any]],
-    changes: StageChanges | str | None,
+    changes: StageChanges | list[str] | None,
     costs: Mapping[str, tuple[float, float]],
     *,
     is_held: bool,
@@ -191,8 +194,8 @@ def _stage(
         flagged = {**_without_garment(place, name), **_flagged(measures)}
     except InputError as error:
         state, why, measures, flagged = "damaged", (str(error),), [], {}
-    if isinstance(changes, str):
-        why = (*why, changes)
+    if isinstance(changes, list):
+        why, state = (*why, *changes), "stale" if changes and name == "report" and state == "done" else state
     elif changes is not None:
         why = (*why, *_words(changes))
         state = "stale" if state == "done" and changes.state == "outdated" else state
@@ -219,7 +222,7 @@ def _words(changes: StageChanges) -> Iterator[str]:
 
 
 def _counts(
-    place: Path, files: str, record: Mapping[str, Any], changes: StageChanges | str | None
+    place: Path, files: str, record: Mapping[str, Any], changes: StageChanges | list[str] | None
 ) -> tuple[int | None, int | None]:
     """Frames that are done, and those of the take."""
     done = _count(place / files)
