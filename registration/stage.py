@@ -40,6 +40,7 @@ from capture4d.files.arrays import ArrayFile
 from capture4d.files.atomic import nan_to_none, read_json, write_json, write_json_lines, write_npz
 from capture4d.files.records import save_garment
 from capture4d.runs.changes import StageChanges
+from capture4d.runs.frame_lists import frame_file
 from capture4d.runs.growing import GrowingStage, Pending, Reads, open_growing_stage, stage_changes
 from capture4d.runs.made import Ledger, digest_of, noted
 from capture4d.runs.stage import Stage, StageResult
@@ -196,7 +197,7 @@ class _Chain:
     """Whether a frame starts from the one before; else it matters only that there is one."""
 
     def path(self, frame_id: int) -> Path:
-        return self.ledger.folder.joinpath("frames", f"{frame_id:06d}.npz")
+        return frame_file(self.ledger.folder, frame_id)
 
     def inputs(self, position: int, before: int | None) -> dict[str, str]:
         """What the frame at a position is made from, if it can start from the one at another."""
@@ -244,7 +245,7 @@ def _chain(
     read = asdict(config)
     for cut in ("segment", "keyframe_bend_deg"):  # what they decide shows in where frames start from
         del read["sequence"][cut]
-    found = [garments.of(garments.folder.joinpath("frames", f"{frame_id:06d}.npz")) for frame_id in frame_ids]
+    found = [garments.of(frame_file(garments.folder, frame_id)) for frame_id in frame_ids]
     return _Chain(
         ledger,
         frame_ids,

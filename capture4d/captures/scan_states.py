@@ -16,6 +16,7 @@ from pathlib import Path
 from capture4d.captures.capture import Capture, scan_path
 from capture4d.errors import InputError, StaleError
 from capture4d.files.reading import companions_named
+from capture4d.runs.frame_lists import frame_file
 from capture4d.runs.made import FileState, Ledger, digest_of, file_state, is_as
 from capture4d.runs.stage import read_record
 
@@ -107,7 +108,7 @@ def require_same_take(folder: Path, capture: Capture) -> None:
     if record.get("status") == "discarded" or place is None or Path(place) == capture.path.resolve():
         return
     ledger = Ledger.read(folder)
-    paths = {each: folder / "frames" / f"{each:06d}.npz" for each in capture.frame_ids}
+    paths = {each: frame_file(folder, each) for each in capture.frame_ids}
     known = [each for each, path in paths.items() if ledger.of(path) is not None]
     if known and all(replaced_scan(ledger, paths[each], capture, each) for each in known):
         raise StaleError(

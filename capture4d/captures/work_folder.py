@@ -25,7 +25,7 @@ from capture4d.files.atomic import (
 from capture4d.files.reading import reading
 from capture4d.files.records import load_body, load_garment, load_poses
 from capture4d.runs.changes import description_changes, frame_changes
-from capture4d.runs.frame_lists import counted
+from capture4d.runs.frame_lists import counted, frame_file
 from capture4d.runs.growing import frames_of
 from capture4d.runs.made import Ledger
 from capture4d.runs.stage import Stage, complete_record, read_record, require_complete
@@ -225,9 +225,7 @@ def require_from_scans(folder: Path, name: str, command: str, capture: Capture) 
     words = frame_changes(sorted({*capture.frame_ids, *made_for}), made_for)  # more than are asked for will do
     said = record.get("description", {})
     words += description_changes(capture.entries(*said), said)
-    paths = {
-        frame_id: folder.joinpath("frames", f"{frame_id:06d}.npz") for frame_id in {*capture.frame_ids} & {*made_for}
-    }
+    paths = {frame_id: frame_file(folder, frame_id) for frame_id in {*capture.frame_ids} & {*made_for}}
     replaced = sorted(each for each, path in paths.items() if replaced_scan(ledger, path, capture, each))
     if replaced:
         words.append(counted(replaced, "replaced"))

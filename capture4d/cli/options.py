@@ -81,8 +81,10 @@ class TakeOptions:
     frames: str | None = None
     """Only these frames of the take, such as 1,5,10-20 or, every fifth, 1-200:5; what is known of others is kept."""
 
-    def taken(self, capture: Path) -> Capture:
+    def taken(self, capture: Path) -> Capture | Path:
         """The capture in a folder, of the frames that are asked for."""
+        if self.frames is None:
+            return capture
         from capture4d.captures.capture import read_capture
 
         return read_capture(capture).choosing(self.frames)

@@ -40,7 +40,7 @@ from capture4d.errors import InputError
 from capture4d.extraction.garment import ColourNotFoundError, cut_out
 from capture4d.files.atomic import write_json, write_npz
 from capture4d.runs.changes import StageChanges, say
-from capture4d.runs.frame_lists import counted, listed
+from capture4d.runs.frame_lists import counted, frame_file, listed
 from capture4d.runs.growing import GrowingStage, Pending, Reads, open_growing_stage, stage_changes
 from capture4d.runs.made import Ledger, digest_of, make
 from capture4d.runs.stage import StageResult
@@ -155,7 +155,7 @@ def _inputs(capture: Capture, colours: KnownColours) -> dict[str, str]:
 
 def _pending(capture: Capture, ledger: Ledger, inputs: Mapping[str, str]) -> Pending:
     """Frames that are to be extracted."""
-    paths = {frame_id: ledger.folder.joinpath("frames", f"{frame_id:06d}.npz") for frame_id in capture.frame_ids}
+    paths = {frame_id: frame_file(ledger.folder, frame_id) for frame_id in capture.frame_ids}
     frames = [each for each, path in paths.items() if not stands_with_scan(ledger, path, capture, each, inputs)]
     replaced = [each for each in frames if replaced_scan(ledger, paths[each], capture, each)]
     return Pending(tuple(frames), replaced=tuple(replaced))

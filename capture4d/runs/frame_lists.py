@@ -1,13 +1,15 @@
-"""Frames as people write them: `1,5,10-20`, and with a step, `1-200:5`."""
+"""Frames as people write them: `1,5,10-20`, and with a step, `1-200:5`; and where their files lie."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
+from functools import lru_cache
+from pathlib import Path
 
 from capture4d.errors import InputError
 
-__all__ = ["chosen_frames", "counted", "expanded", "listed"]
+__all__ = ["chosen_frames", "counted", "expanded", "frame_file", "listed"]
 
 _PART = re.compile(r"\s*([0-9]{1,10})\s*(?:-\s*([0-9]{1,10})\s*(?::\s*([0-9]{1,10})\s*)?)?")
 
@@ -70,6 +72,15 @@ def counted(frame_ids: Sequence[int], what: str) -> str:
     if len(frame_ids) == 1:
         return f"frame {frame_ids[0]} {what}"
     return f"{len(frame_ids)} frames {what} ({listed(frame_ids)})"
+
+
+@lru_cache(maxsize=200_000)
+def frame_file(folder: Path, frame_id: int, suffix: str = ".npz", within: str = "frames") -> Path:
+    """A frame's file in a stage's folder: `<folder>/<within>/000123<suffix>`.
+
+    Remembered, for stages ask for the files of a long take again and again, and pathlib takes its time.
+    """
+    return folder.joinpath(within, f"{frame_id:06d}{suffix}")
 
 
 def _runs(frame_ids: Sequence[int]) -> list[str]:

@@ -20,6 +20,7 @@ documentation) for times of files that are too fresh to be believed.
 from __future__ import annotations
 
 import contextlib
+import gc
 import hashlib
 import json
 import os
@@ -81,10 +82,11 @@ class Ledger:
     @staticmethod
     def read(folder: Path) -> Ledger:
         """What is known, without writing anything."""
-        made = dict(_settled(folder / MADE))
-        journals = sorted((folder / JOURNALS).glob("*.jsonl"))
-        for path in journals:
-            made.update(_lines(path))
+        with _collector_at_rest():
+            made = dict(_settled(folder / MADE))
+            journals = sorted((folder / JOURNALS).glob("*.jsonl"))
+            for path in journals:
+                made.update(_lines(path))
         known = {place: each for place, each in made.items() if each is not _GONE} if journals else made
         return Ledger(folder, known, not journals)
 
@@ -232,6 +234,19 @@ def _line(place: str, made: Made) -> str:
 
 def _gone(place: str) -> str:
     return json.dumps({"path": place}) + "\n"
+
+
+@contextlib.contextmanager
+def _collector_at_rest() -> Iterator[None]:
+    """Nothing that is made inside is in a circle; looking for circles again and again, while a hundred thousand small
+    objects come to be, takes most of the time."""
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
 
 
 def _settled(path: Path) -> Mapping[str, Made]:

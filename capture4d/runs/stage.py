@@ -24,6 +24,7 @@ from capture4d.files.json_values import entry, text, whole
 from capture4d.files.reading import reading
 from capture4d.runs.changes import input_changes, setting_changes
 from capture4d.runs.decisions import DECISIONS
+from capture4d.runs.frame_lists import frame_file
 from capture4d.runs.locks import LOCK
 
 __all__ = [
@@ -90,7 +91,7 @@ class Stage:
 
     def frame_path(self, frame_id: int, suffix: str = ".npz", *, folder: str = "frames") -> Path:
         """Where a frame's file goes: `<stage>/<folder>/000123<suffix>`."""
-        return self.path.joinpath(folder, f"{frame_id:06d}{suffix}")
+        return frame_file(self.path, frame_id, suffix, folder)
 
     def pending(self, frame_ids: Iterable[int], suffix: str = ".npz", *, folder: str = "frames") -> list[int]:
         """The frames that have no valid file yet, in the order given."""

@@ -38,8 +38,8 @@ def refine_jobs(take: TrackedTake, shape: TakeShape) -> list[RefineJob]:
     jobs = []
     for frame_id, around in zip(capture.frame_ids, _surroundings(take), strict=True):
         own = followed_frame(take, frame_id)
-        near = [[each - frame_id, followed_frame(take, each).digest] for each in around]
-        inputs = {"settings": settings, "first": own.digest, "around": digest_of(near)}
+        near = " ".join(f"{each - frame_id}: {followed_frame(take, each).digest}" for each in around)
+        inputs = {"settings": settings, "first": own.digest, "around": near}
         path = stage.frame_path(frame_id, folder="refined")
         if not stands_with_scan(stage.ledger, path, capture, frame_id, inputs):
             jobs.append(RefineJob(frame_id, shape.coefficients, around, own.said["lost"], inputs))
