@@ -162,10 +162,11 @@ def run(
     Returns:
         The registration's result; its path is the page of the report, if that was drawn.
     """
-    opened = _capture(capture)
+    from capture4d.preflight.readiness import require_ready
+
+    opened, config, tracking = _capture(capture), config or RegistrationConfig(), tracking or TrackingConfig()
     tracked = tracked or _needs_tracking(opened)
-    if not tracked:
-        _ = opened.poses  # what is wrong with it is said before the work, not after
+    require_ready(opened, _path(work), config, tracking if tracked else None, anew=overwrite)
     extract(opened, work, workers=workers, overwrite=overwrite)
     if tracked:
         track(opened, work, tracking, workers=workers, overwrite=overwrite)

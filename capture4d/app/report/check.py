@@ -16,6 +16,9 @@ LEARNED = (
 )
 
 
+SHOWN = 5
+"""Files that no stage takes are counted, and so many of them named."""
+
 Status = Literal["clean", "warnings", "errors"]
 
 
@@ -47,6 +50,7 @@ def as_json(checked: Checked) -> dict[str, Any]:
             for finding in checked.verdict.findings
         ],
         "scores": {code: round(score, 3) for code, score in checked.verdict.scores.items()},
+        "unlisted": list(checked.take.facts.unlisted),
         "fixed": None if checked.fixed is None else str(checked.fixed),
     }
 
@@ -70,6 +74,11 @@ def print_table(checked: Checked) -> None:
         console.print(table)
     else:
         console.print(f"{checked.take.path}: clean ({looked} looked at)", highlight=False, soft_wrap=True)
+    unlisted = checked.take.facts.unlisted
+    if unlisted:
+        shown = ", ".join(unlisted[:SHOWN]) + (", ..." if len(unlisted) > SHOWN else "")
+        line = f"Beside the frames, taken by no stage: {len(unlisted)} files, {shown}"
+        console.print(line, highlight=False, soft_wrap=True, markup=False)
     if _learns(checked):
         console.print(LEARNED, highlight=False, soft_wrap=True)
 

@@ -86,6 +86,7 @@ class Register(GradedOptions, MeshOptions):
     def __call__(self) -> int:
         from capture4d import pipeline
 
+        _say_lengths(self.capture)
         result = pipeline.register(
             self.capture,
             self.output,
@@ -116,6 +117,7 @@ class Run(GradedOptions, MeshOptions):
     def __call__(self) -> int:
         from capture4d import pipeline
 
+        _say_lengths(self.capture)
         result = pipeline.run(
             self.capture,
             self.output,
@@ -128,6 +130,14 @@ class Run(GradedOptions, MeshOptions):
         _say_clouds(self.output)
         print(f"report: {result.path}")
         return self.graded(result)
+
+
+def _say_lengths(capture: Path) -> None:
+    """Tell where the lengths of the cloth come from, before a night is spent on it."""
+    from capture4d.captures.capture import read_capture
+    from capture4d.preflight.readiness import pattern_told
+
+    print(pattern_told(read_capture(capture)))
 
 
 def _say_clouds(work: Path) -> None:
