@@ -26,7 +26,7 @@ from capture4d.body.anny import load_anny
 from capture4d.mesh_files.meshes import write_mesh
 from capture4d.preflight.check import check_take
 from capture4d.preflight.findings import Code
-from capture4d.preflight.fix import write_fixed
+from capture4d.preflight.repair.fix import write_fixed
 from data_synth.config import MotionConfig
 from data_synth.scanner.config import RigConfig
 
@@ -262,7 +262,7 @@ def run(*, quick: bool = False, memory_frames: int = 80) -> list[Metric]:
             console.print(f"{name}: {', '.join(found) or 'clean'} ({score:.2g})", highlight=False)
             if expected in REPAIRED and expected in found:
                 fixed += 1
-                repaired += not check_take(write_fixed(checked), all_frames=True).verdict.findings
+                repaired += not check_take(write_fixed(checked).path, all_frames=True).verdict.findings
         growth = _memory_growth(Path(scratch), next(iter(bases.values())), 24 if quick else memory_frames)
     _print_rows(rows)
     damaged = [row for row in rows if row.expected]

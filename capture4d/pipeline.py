@@ -149,15 +149,16 @@ def run(
         tracking: settings of `track`.
         tracked: track the body even if the capture brings poses.
         draw: False leaves the report out.
-        overwrite: begin anew with the first stage whose settings are others than before, and keep what it is made from;
-            with the first of all if none are.
+        overwrite: begin anew with the first stage whose settings have changed; with the first of all if none have.
     Returns:
         The registration's result; its path is the page of the report, if that was drawn.
     """
+    from capture4d.preflight.readiness import require_ready
+
     opened, folder = opened_capture(capture), path_of(work)
+    config, tracking = config or RegistrationConfig(), tracking or TrackingConfig()
     tracked = tracked or needs_tracking(opened)
-    if not tracked:
-        _ = opened.poses  # what is wrong with it is said before the work, not after
+    require_ready(opened, folder, config, tracking if tracked else None, anew=overwrite)
     anew = made_anew(changes(opened, folder, config, tracking=tracking, tracked=tracked)) if overwrite else ()
     extract(opened, folder, workers=workers, overwrite="extract" in anew)
     if tracked:

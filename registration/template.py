@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float64, Int32
 
 from capture4d.body.sewing_pattern import with_known_pattern
+from capture4d.captures.names import unknown_borders
 from capture4d.errors import InputError
 from capture4d.geometry.mesh import edge_uses, edges_of_faces, unique_edges
 from capture4d.types import Garment
@@ -102,12 +103,12 @@ class UnknownBorderError(InputError):
 
 
 def require_borders(border: Border, painted: Iterable[str]) -> None:
-    """See that the template has every loop that a paint is named after.
+    """See that the template has every border that a paint is named after; such as are called `border` are on any.
 
     Raises:
         UnknownBorderError: it has not; the message names both lists.
     """
-    missing = sorted(set(painted) - set(border.names))
+    missing = unknown_borders(painted, border.names)
     if missing:
         found = f"those named {', '.join(border.names)}" if border.names else "none"
         raise UnknownBorderError(

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Hashable, Iterable, Mapping
 
 from capture4d.errors import InputError
 
-__all__ = ["require_plain_names", "require_text"]
+__all__ = ["require_plain_names", "require_text", "telling_names", "unknown_borders"]
 
 LONGEST = 100
 """Characters; a file system's limit is 255 bytes, and endings come behind."""
 _RESERVED = re.compile(r"(con|prn|aux|nul|com[0-9¹²³]|lpt[0-9¹²³])(\..*)?", re.IGNORECASE)
 """What Windows takes for a device, with any ending."""
+_NAMELESS = re.compile(r"border|paint_[0-9]+")
+"""What capture4d itself calls a paint of which it does not know which border wears it."""
 _SEPARATORS = '/\\:*?"<>|'
 
 
@@ -45,6 +48,24 @@ def require_plain_names(names: Iterable[object], what: str) -> None:
         leads = text != text.strip() or text.startswith(".") or text.endswith(".") or _RESERVED.fullmatch(text)
         if leads or any(letter in _SEPARATORS for letter in text):
             raise InputError(f"name of a {what}: expected one that can be a file's on any system, found {text!a}")
+
+
+def unknown_borders(painted: Iterable[str], loops: Iterable[str]) -> tuple[str, ...]:
+    """Borders after which paints are named and which a template does not have, in order.
+
+    `border` and `paint_0`, which `check --fix` and `extract` write where no template tells them better, name none: such
+    a paint may be on any border.
+
+    Args:
+        painted: names of the paints that tell their border, as `telling_names` has them.
+    """
+    return tuple(sorted(name for name in {*painted} - {*loops} if not _NAMELESS.fullmatch(name)))
+
+
+def telling_names(paints: Mapping[str, Hashable]) -> list[str]:
+    """Names of the borders whose paint no other border wears: a paint on several does not tell them apart."""
+    worn = Counter(paints.values())
+    return [name for name, paint in paints.items() if worn[paint] == 1]
 
 
 def _shown(value: object) -> str:

@@ -23,7 +23,7 @@ from capture4d.geometry.seams import weld
 from capture4d.mesh_files.meshes import READABLE, read_coloured_mesh
 from capture4d.types import Mesh
 
-__all__ = ["KINDS", "ScanFiles", "Surface", "frame_numbers", "list_scans", "read_surface", "whole_surface"]
+__all__ = ["KINDS", "ScanFiles", "Surface", "frame_numbers", "is_aside", "list_scans", "read_surface", "whole_surface"]
 
 KINDS = (".ply", ".glb", ".gltf", ".obj", ".off", ".stl")
 """Of several files with one number the first kind counts, and there the first name."""
@@ -79,8 +79,12 @@ def _files(folder: Path) -> list[Path]:
         return sorted(folder / entry.name for entry in entries if not entry.name.startswith("."))
 
 
+def is_aside(path: Path) -> bool:
+    """Hidden files are no scans; and a folder of scans that is no capture may hold the template as well."""
+    return path.name.startswith(".") or _is_template(path)
+
+
 def _is_template(path: Path) -> bool:
-    """A folder of scans that is no capture may hold the template as well."""
     return path.parent.name != "scans" and path.stem.lower().startswith("template")
 
 

@@ -226,9 +226,9 @@ def _alone(command: Any) -> Iterator[None]:
 def _written_by(command: Any) -> Path | None:
     """The folder, or the file, that a command writes to; None if it writes nothing."""
     if isinstance(command, Check):
-        from capture4d.preflight.fix import fixed_path
+        from capture4d.preflight.repair.fix import fixed_path
 
-        return fixed_path(command.capture) if command.fix else None
+        return command.output or fixed_path(command.capture) if command.fix else None
     if isinstance(command, Report):
         return command.work / "report" if command.work.is_dir() else None
     if isinstance(command, Fit) and command.output is None:

@@ -62,6 +62,8 @@ class Checked:
     """Frames a second by motion capture or time stamps."""
     fixed: Path | None = None
     """Folder of the corrected take, if there is one."""
+    how_fixed: str = ""
+    """How many of its scans are the originals, and how many new."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

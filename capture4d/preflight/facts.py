@@ -37,6 +37,8 @@ class TakeFacts:
     paints: Paints = field(default_factory=Paints)
     border_names: tuple[tuple[str, ...], ...] = ()
     """Names of the borders of each paint."""
+    borders_claimed: bool = False
+    """The paints are those of the caller, who names no borders."""
     frame_ids: tuple[int, ...] = ()
     """All frame numbers with a file that the stages take, ascending."""
     listed: tuple[int, ...] | None = None
@@ -47,3 +49,9 @@ class TakeFacts:
     """Frame numbers with more than one file."""
     pose_frames: tuple[int, ...] | None = None
     pose_fps: float | None = None
+    template_loops: tuple[str, ...] | None = None
+    """Names of the template's borders; None without a template, or if it cannot be read."""
+    template_fault: str = ""
+    """Why the template cannot be registered."""
+    unlisted: tuple[str, ...] = ()
+    """Files among the scans that no stage takes: of frames that the description does not list, or without a number."""

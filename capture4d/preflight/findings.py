@@ -41,6 +41,8 @@ Code = Literal[
     "scale-jump",
     "poses-missing",
     "poses-mismatch",
+    "template",
+    "borders-named",
 ]
 CODES: tuple[Code, ...] = get_args(Code)
 
@@ -79,6 +81,11 @@ ADVICE: Mapping[Code, tuple[Severity, str]] = {
     "scale-jump": ("error", "reconstruct these frames with the others' calibration; --fix leaves them out"),
     "poses-missing": ("warning", "export the motion capture of all frames; --fix leaves the scans without a pose out"),
     "poses-mismatch": ("error", "check that poses.npz and body.npz are of this subject, take and time"),
+    "template": ("error", "export the garment mesh again, or make the template anew with `capture4d template`"),
+    "borders-named": (
+        "error",
+        "name the paints in boundary_colours as the template names its borders; --fix does where all have one paint",
+    ),
 }
 
 

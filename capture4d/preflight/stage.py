@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from capture4d.preflight.check import Checked, check_take
-from capture4d.preflight.fix import write_fixed
+from capture4d.preflight.repair.fix import require_place, write_fixed
 from capture4d.preflight.take_folder import Claims
 
 __all__ = ["run"]
@@ -33,9 +33,12 @@ def run(
         all_frames: look at every frame instead of a sample.
     Raises:
         InputError: there is nothing to look at, or a description, rig or body cannot be read; or there is already
-            something where the corrected take would go.
+            something where the corrected take would go, which is said before anything is looked at.
     """
+    if output is not None:
+        require_place(output, capture)
     checked = check_take(capture, claims, all_frames=all_frames or output is not None, workers=workers)
     if output is None or not checked.verdict.findings:
         return checked
-    return replace(checked, fixed=write_fixed(checked, output, workers=workers))
+    fixed = write_fixed(checked, output, workers=workers)
+    return replace(checked, fixed=fixed.path, how_fixed=fixed.told())

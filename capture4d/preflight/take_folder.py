@@ -16,15 +16,16 @@ import numpy as np
 from capture4d.body.anny import load_anny
 from capture4d.body.posed_surface import BodyState, TrackedBody, tracked_body
 from capture4d.body.skinning import ShapedBody, pose_frame, with_shape
+from capture4d.captures.capture import Capture, template_path
 from capture4d.captures.description import Description, parse_description
-from capture4d.captures.scan_files import KINDS, Surface, list_scans, read_surface
+from capture4d.captures.scan_files import KINDS, ScanFiles, Surface, is_aside, list_scans, read_surface
 from capture4d.colours.spaces import Colour, parse_colour
 from capture4d.errors import EmptyMeshError, InputError, NotFiniteError
 from capture4d.files.atomic import read_json
 from capture4d.files.records import load_body, load_poses, load_rig
 from capture4d.preflight.facts import BadFrame, Paints, TakeFacts
 from capture4d.types import PoseSequence, Rig
-from capture4d.units import METRES
+from capture4d.units import METRES, Units
 
 __all__ = ["CapturedMotion", "Claims", "TakeFolder", "load_motion", "open_take", "read_frame", "time_stamp"]
 
@@ -104,9 +105,48 @@ def open_take(path: Path, claims: Claims | None = None) -> TakeFolder:
     rig = load_rig(rig_path) if rig_path else None
     poses = load_poses(poses_path) if poses_path else None
     facts = _facts(said, claims, tuple(files), poses)
-    facts = replace(facts, duplicated=tuple(also), dropped=tuple(sorted({*facts.dropped, *unlisted})))
+    facts = replace(
+        facts,
+        duplicated=tuple(also),
+        dropped=tuple(sorted({*facts.dropped, *unlisted})),
+        unlisted=_unlisted(folder, found, said, claims),
+        **_template_facts(path, tuple(files), said.units, painted=bool(facts.border_names)),
+    )
     moving = poses is not None and (body_path is not None or poses.joint_names == load_anny().joint_names)
     return TakeFolder(path, files, also, description, facts, rig, poses_path, body_path, moving, claims)
+
+
+def _unlisted(folder: Path, found: ScanFiles, said: Description, claims: Claims) -> tuple[str, ...]:
+    """Names of meshes among the scans that no stage takes, and that the description does not say were left out."""
+    taken = {path.name for paths in ([*found.scans.values()], *found.also.values()) for path in paths}
+    numberless = [
+        path.name
+        for path in folder.iterdir()
+        if path.suffix.lower() in KINDS and path.name not in taken and not is_aside(path) and not claims.frames
+    ]
+    if claims.frames or said.frames is None:
+        return tuple(sorted(numberless))
+    known = {*said.frames, *said.dropped}
+    beside = [path.name for number, path in found.scans.items() if number not in known]
+    return tuple(sorted([*numberless, *beside]))
+
+
+def _template_facts(path: Path, frame_ids: tuple[int, ...], units: Units, *, painted: bool) -> dict[str, Any]:
+    """What of the template can be said at once: the names of its borders, or why it cannot be registered."""
+    capture = Capture(path, "", 1.0, frame_ids, None, units=units)
+    try:
+        template_path(capture)
+    except InputError:
+        return {}  # it may come later
+    try:
+        loops = tuple(capture.template.loops)
+    except InputError as error:
+        return {"template_fault": str(error)}
+    if not len(capture.template.template.faces):
+        return {"template_fault": "has no faces"}
+    if painted and not loops:
+        return {"template_fault": "has no open borders, and the take has painted ones", "template_loops": ()}
+    return {"template_loops": loops}
 
 
 def _kind(path: Path) -> str:
@@ -144,6 +184,7 @@ def _facts(said: Description, claims: Claims, frame_ids: tuple[int, ...], poses:
         declared=declared,
         paints=Paints(garment, tuple(borders)),
         border_names=tuple(tuple(names) for names in borders.values()),
+        borders_claimed=bool(claims.border_colours),
         frame_ids=frame_ids,
         listed=said.frames,
         dropped=said.dropped,

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from capture4d.captures.names import unknown_borders
 from capture4d.colours.spaces import colour_angles, to_lab
 from capture4d.preflight.facts import BadFrame, TakeFacts
 from capture4d.preflight.findings import CODES, Code, Finding, Limits, Verdict
@@ -36,7 +37,7 @@ def judge(
     """
     limits = limits or Limits()
     frames = sorted(frames, key=lambda frame: frame.frame_id)
-    checks = [*_check_bad(bad_frames), *_check_numbers(facts)]
+    checks = [*_check_bad(bad_frames), *_check_numbers(facts), *_check_template(facts)]
     if survey is not None:
         checks += _check_survey(survey, facts, limits)
     if frames:
@@ -109,6 +110,15 @@ def _check_numbers(facts: TakeFacts) -> Iterator[Finding]:
         yield Finding("poses-missing", f"no pose for {_count(unposed)}", _CERTAIN, _sorted(unposed))
     else:
         yield Finding("poses-missing", "none", 0.0)
+
+
+def _check_template(facts: TakeFacts) -> Iterator[Finding]:
+    yield Finding("template", facts.template_fault or "can be registered", _CERTAIN * bool(facts.template_fault))
+    loops = facts.template_loops
+    painted = [names[0] for names in facts.border_names if len(names) == 1 and not facts.borders_claimed]
+    unknown = unknown_borders(painted, loops) if loops else ()
+    said = f"paints named {', '.join(unknown)}; the template's borders are {', '.join(loops or ())}"
+    yield Finding("borders-named", said if unknown else "as the template's", _CERTAIN * bool(unknown))
 
 
 # --- coordinates -------------------------------------------------------------------------------------------------

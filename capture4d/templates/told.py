@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 
+from capture4d.captures.description import parse_description
+from capture4d.captures.names import telling_names, unknown_borders
+from capture4d.errors import InputError
+from capture4d.files.atomic import read_json
 from capture4d.templates.stage import TemplateResult
 
 __all__ = ["told"]
@@ -21,6 +26,22 @@ def told(result: TemplateResult) -> Iterator[str]:
     loops = ", ".join(f"{name} ({len(loop)})" for name, loop in garment.loops.items())
     yield f"borders: {loops}; with these names their paints stand in boundary_colours"
     yield f"UVs: {_uvs(result)}"
+    yield from _other_names(result)
+
+
+def _other_names(result: TemplateResult) -> Iterator[str]:
+    """If the template lies in a capture whose paints are named after other borders, that: `run` would refuse it."""
+    description = result.path.parent / "capture.json"
+    if not description.is_file():
+        return
+    with contextlib.suppress(InputError):  # `check` says what is wrong with it
+        paints = parse_description(read_json(description)).boundary_colours
+        unknown = unknown_borders(telling_names(paints), result.garment.loops)
+        if unknown:
+            yield (
+                f"{description}: boundary_colours names {', '.join(unknown)}, which the template does not have; "
+                "rename the paints there, or the borders with --names"
+            )
 
 
 def _uvs(result: TemplateResult) -> str:

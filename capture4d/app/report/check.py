@@ -19,6 +19,9 @@ LEARNED = (
 )
 
 
+SHOWN = 5
+"""Files that no stage takes are counted, and so many of them named."""
+
 Status = Literal["clean", "warnings", "errors"]
 
 
@@ -50,6 +53,7 @@ def as_json(checked: Checked) -> dict[str, Any]:
             for finding in checked.verdict.findings
         ],
         "scores": {code: round(score, 3) for code, score in checked.verdict.scores.items()},
+        "unlisted": list(checked.take.facts.unlisted),
         "fixed": None if checked.fixed is None else str(checked.fixed),
     }
 
@@ -109,5 +113,10 @@ def print_table(checked: Checked) -> None:
         console.print(f"check: {looked} looked at; {_counted(checked.verdict)}", highlight=False, soft_wrap=True)
     else:
         console.print(f"{checked.take.path}: clean ({looked} looked at)", highlight=False, soft_wrap=True)
+    unlisted = checked.take.facts.unlisted
+    if unlisted:
+        shown = ", ".join(unlisted[:SHOWN]) + (", ..." if len(unlisted) > SHOWN else "")
+        line = f"Beside the frames, taken by no stage: {len(unlisted)} files, {shown}"
+        console.print(line, highlight=False, soft_wrap=True, markup=False)
     if _learns(checked):
         console.print(LEARNED, highlight=False, soft_wrap=True)

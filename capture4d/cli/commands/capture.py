@@ -12,6 +12,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 from capture4d.calibration.config import CalibrationConfig, RigCheckConfig
 from capture4d.cli.exit_codes import BAD_RESULT, GOOD
 from capture4d.cli.options import MeshOptions, ProgressOptions, all_cores
+from capture4d.errors import InputError
 from capture4d.settings import Count, Positive
 
 __all__ = ["Calibrate", "Check", "CheckRig"]
@@ -42,7 +43,10 @@ class Check(ProgressOptions, MeshOptions):
     all: bool = False
     """Look at every frame instead of a sample."""
     fix: bool = False
-    """Write a corrected take to CAPTURE-fixed; looks at every frame."""
+    """Write a corrected take to CAPTURE-fixed; looks at every frame. Scans that are sound as they are become hard links
+    to the originals."""
+    output: Path | None = None
+    """Folder for the corrected take, with --fix, instead of CAPTURE-fixed."""
     strict: bool = False
     """Exit code 3 for warnings, too."""
     json: bool = False
@@ -57,7 +61,7 @@ class Check(ProgressOptions, MeshOptions):
 
         from capture4d import pipeline
         from capture4d.app.report.check import as_json, print_table, status, write_page
-        from capture4d.preflight.fix import fixed_path
+        from capture4d.preflight.repair.fix import fixed_path
         from capture4d.preflight.take_folder import Claims
 
         claims = Claims(
@@ -70,14 +74,18 @@ class Check(ProgressOptions, MeshOptions):
             self.poses,
             self.body,
         )
-        output = fixed_path(self.capture) if self.fix else None
+        if self.output is not None and not self.fix:
+            raise InputError("--output: expected --fix with it, for only a corrected take is written")
+        output = (self.output or fixed_path(self.capture)) if self.fix else None
         checked = pipeline.check(self.capture, output, claims, all_frames=self.all, workers=self.workers)
         if self.json:
             print(json.dumps(as_json(checked), indent=2))
         else:
             print_table(checked)
             if checked.fixed is not None:
-                print(f"corrected: {checked.fixed}")
+                print(f"corrected: {checked.fixed} ({checked.how_fixed})")
+            elif self.fix:
+                print("nothing to correct, nothing written")
         if self.page is not None:
             write_page(self.page, checked)
         bad = ("warnings", "errors") if self.strict else ("errors",)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
@@ -15,6 +15,9 @@ from capture4d.cli.options import DecidingOptions, GradedOptions, MeshOptions, S
 from capture4d.cli.verdict import say_flagged, say_verdict, say_work
 from capture4d.tracking.config import TrackingConfig
 from registration.config import RegistrationConfig
+
+if TYPE_CHECKING:
+    from capture4d.captures.capture import Capture
 
 __all__ = ["Extract", "Register", "Report", "Run", "Track"]
 
@@ -110,6 +113,7 @@ class Register(DryRunOptions, TakeOptions, GradedOptions, MeshOptions):
                 taken, self.output, self.config,
                 tracked=self.tracked, workers=self.workers, overwrite=self.overwrite,
             ))  # fmt: skip
+        _say_lengths(taken)
         result = pipeline.register(
             taken,
             self.output,
@@ -148,6 +152,7 @@ class Run(DryRunOptions, DecidingOptions, GradedOptions, MeshOptions):
                 renew=self.to_renew, workers=self.workers, overwrite=self.overwrite,
             ))  # fmt: skip
         self.renewed(self.output)
+        _say_lengths(taken)
         result = pipeline.run(
             taken,
             self.output,
@@ -161,6 +166,13 @@ class Run(DryRunOptions, DecidingOptions, GradedOptions, MeshOptions):
         say_work(self.output)
         print(f"report: {result.path}")
         return self.graded(result)
+
+
+def _say_lengths(capture: Capture) -> None:
+    """Tell where the lengths of the cloth come from, before a night is spent on it."""
+    from capture4d.preflight.readiness import pattern_told
+
+    print(pattern_told(capture))
 
 
 def _say_clouds(work: Path) -> None:

@@ -3,10 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from capture4d.geometry.mesh import unique_edges
 from capture4d.types import Mesh
-from registration.template import analyse_template, rest_lengths
+from registration.template import UnknownBorderError, analyse_template, require_borders, rest_lengths
 
 
 def test_lengths_come_from_a_pattern_and_else_from_the_mesh(garment) -> None:
@@ -38,6 +39,14 @@ def _one_by_one(mesh: Mesh) -> np.ndarray:
     """Every triangle squeezed by a tenth, beside the one before."""
     corners = mesh.vertices[mesh.faces]
     return (corners[..., :2] * (0.9, 1.0) + np.arange(len(corners))[:, None, None]).astype(np.float32)
+
+
+def test_paints_that_name_no_border_may_be_on_any(garment, config) -> None:
+    border = analyse_template(garment, config).border
+    require_borders(border, ["hem", "border", "paint_0", "paint_12"])
+    for name in ("borders", "paint_x", "Hem"):
+        with pytest.raises(UnknownBorderError, match=f"expected border loops named {name}, as the paints are; found"):
+            require_borders(border, ["neck", name])
 
 
 def test_laplacian_vanishes_on_constants_and_follows_the_border(garment, config) -> None:

@@ -20,7 +20,7 @@ from capture4d.cli.main import main
 from capture4d.colours.spaces import to_lab
 from capture4d.errors import InputError
 from capture4d.files.atomic import write_json
-from capture4d.files.records import load_poses, save_body, save_poses
+from capture4d.files.records import load_poses, save_body, save_garment, save_poses
 from capture4d.mesh_files.meshes import read_coloured_mesh, read_mesh, write_mesh
 from capture4d.mesh_files.textures import mean_at_vertices, sampled
 from capture4d.motions.retargeting import pose_sequence
@@ -38,7 +38,8 @@ from capture4d.preflight.statistics import (
 from capture4d.preflight.survey import find_units
 from capture4d.preflight.take_folder import open_take, time_stamp
 from capture4d.preflight.verdict import judge
-from capture4d.types import Mesh, Rig, Scan
+from capture4d.types import Garment, Mesh, Rig, Scan
+from tests.command_line import fails, run
 from tests.shapes import ring
 
 BLUE, YELLOW, GREY = (47, 98, 201), (255, 196, 0), (150, 152, 156)
@@ -109,6 +110,11 @@ def moved(scans: dict[int, Scan], matrix: np.ndarray, shift: tuple[float, float,
         return mesh.with_vertices((mesh.vertices @ matrix.T + shift).astype(np.float32))
 
     return {number: replace(scan, mesh=change(scan.mesh)) for number, scan in scans.items()}
+
+
+def opened(mesh: Mesh) -> Mesh:
+    """With a border, as a garment has; no vertex is lost."""
+    return Mesh(mesh.vertices, mesh.faces[1:])
 
 
 def check(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> tuple[int, dict]:
@@ -319,7 +325,7 @@ def test_a_sound_take_is_clean(sound: dict[int, Scan], tmp_path: Path, capsys: p
     code, found = check(capsys, write(tmp_path / "take", sound))
     assert (code, found["status"], found["findings"]) == (0, "clean", [])
     keys = {"format", "capture", "status", "frames", "frames_checked", "colours", "findings", "scores", "fixed"}
-    assert set(found) == keys
+    assert set(found) == keys | {"unlisted"}
     assert found["colours"] == "given"
     assert set(found["scores"]) <= set(CODES)
     assert all(0 <= score <= 1 for score in found["scores"].values())
@@ -410,7 +416,7 @@ def test_a_killed_fix_is_repeated_and_lies_beside_the_take(
 
     monkeypatch.chdir(take)
     with monkeypatch.context() as patched:
-        patched.setattr("capture4d.preflight.fix._copy_companions", die)
+        patched.setattr("capture4d.preflight.repair.fix._copy_companions", die)
         with pytest.raises(SystemExit) as exit_:
             main(["check", ".", "--fix", "--workers", "1"])
         assert exit_.value.code == 130
@@ -420,16 +426,135 @@ def test_a_killed_fix_is_repeated_and_lies_beside_the_take(
     assert sorted(path.name for path in take.iterdir()) == ["capture.json", "scans"]
 
 
+def test_only_what_changes_is_written_anew(sound: dict[int, Scan], tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """A frame rate is one line of capture.json; the scans stay what they are."""
+    frames, paints = [9, *sound], {"border_0": "#ffc400"}
+    take = write(tmp_path / "take", moved(sound, 100 * np.eye(3)), units="cm", frames=frames, boundary_colours=paints)
+    (take / "scans" / "000012.ply").rename(take / "scans" / "Scan0012.PLY")
+    write_mesh(take / "template.obj", opened(moved({0: sound[10]}, 100 * np.eye(3))[0].mesh))
+    target = tmp_path / "elsewhere" / "good"
+    _, found = check(capsys, take, "--fix", "--output", target)
+    assert codes(found) == ["frames-listed"]
+    assert found["fixed"] == str(target)
+    fixed = read_capture(target)
+    assert (fixed.units, fixed.frame_ids) == ("cm", tuple(sound))
+    for number in sound:
+        name = "Scan0012.PLY" if number == 12 else f"{number:06d}.ply"
+        assert (target / "scans" / f"{number:06d}.ply").samefile(take / "scans" / name)
+    np.testing.assert_allclose(fixed.template.template.vertices, sound[10].mesh.vertices, atol=1e-5)
+    assert not list(target.parent.glob(".*")), "nothing else is left"
+    assert not (target / "fix.json").exists()
+
+
+def test_scans_are_copied_where_there_are_no_links(
+    sound: dict[int, Scan], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    def none(*_: object, **__: object) -> None:
+        raise OSError(18, "Invalid cross-device link")
+
+    take = write(tmp_path / "take", sound, frames=[9, *sound])
+    monkeypatch.setattr("os.link", none)
+    with pytest.raises(SystemExit):
+        main(["check", str(take), "--fix", "--workers", "1"])
+    assert f"corrected: {tmp_path / 'take-fixed'} (scans: 5 copied)" in " ".join(capsys.readouterr().out.split())
+    for number in sound:
+        copied, scan = (folder / "scans" / f"{number:06d}.ply" for folder in (tmp_path / "take-fixed", take))
+        assert copied.read_bytes() == scan.read_bytes()
+
+
+def test_textures_go_with_scans_that_stay(sound: dict[int, Scan], tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    take = write(tmp_path / "take", sound, frames=[9, *sound])
+    (take / "scans" / "images").mkdir()
+    (take / "scans" / "images" / "skin.png").write_bytes(b"an image")
+    check(capsys, take, "--fix")
+    assert (tmp_path / "take-fixed" / "scans" / "images" / "skin.png").samefile(take / "scans" / "images" / "skin.png")
+
+
+def test_a_fix_goes_on_where_it_was_killed(
+    sound: dict[int, Scan], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    take = write(tmp_path / "take", moved(sound, 1000 * np.eye(3)))
+    written: list[Path] = []
+
+    def two_at_most(path: Path, *arguments: object, **named: object) -> None:
+        if len(written) == 2:
+            raise KeyboardInterrupt
+        written.append(path)
+        write_mesh(path, *arguments, **named)
+
+    with monkeypatch.context() as patched:
+        patched.setattr("capture4d.preflight.repair.fix.write_mesh", two_at_most)
+        with pytest.raises(SystemExit):
+            main(["check", str(take), "--fix", "--workers", "1"])
+    assert len(written) == 2
+    times = {path.name: path.stat().st_mtime_ns for path in written}
+    assert check(capsys, take, "--fix")[1]["fixed"] == str(tmp_path / "take-fixed")
+    folder = tmp_path / "take-fixed" / "scans"
+    assert {name: (folder / name).stat().st_mtime_ns for name in times} == times
+    assert len(list(folder.iterdir())) == len(sound)
+    assert check(capsys, tmp_path / "take-fixed")[1]["findings"] == []
+
+
+def test_where_a_fix_goes_is_looked_at_first(
+    sound: dict[int, Scan], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    take = write(tmp_path / "take", sound)
+    (tmp_path / "take-fixed").mkdir()
+
+    def look(*_: object, **__: object) -> None:
+        raise AssertionError("looked at frames first")
+
+    monkeypatch.setattr("capture4d.preflight.stage.check_take", look)
+    assert "already there" in fails(capsys, "check", take, "--fix")
+    assert "expected a folder outside the take" in fails(capsys, "check", take, "--fix", "--output", take / "better")
+    assert "--output: expected --fix with it" in fails(capsys, "check", take, "--output", tmp_path / "new")
+
+
+def test_names_of_paints_are_held_to_the_template(
+    sound: dict[int, Scan], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    take = write(tmp_path / "take", sound, boundary_colours={"bottom": "#ffc400"})
+    mesh = read_mesh(take / "scans" / "000010.ply").mesh
+    band = Mesh(mesh.vertices, mesh.faces[:-1])
+    loops = {"hem": mesh.faces[-1], "neck": mesh.faces[-1][::-1].copy()}
+    assert codes(check(capsys, take)[1]) == [], "the template may come later"
+    save_garment(take / "template.npz", Garment(band, {"hem": loops["hem"]}))
+    code, found = check(capsys, take, "--fix")
+    assert (code, codes(found)) == (3, ["borders-named"])
+    assert "paints named bottom; the template's borders are hem" in found["findings"][0]["found"]
+    assert set(read_capture(tmp_path / "take-fixed").boundary_colours) == {"hem"}
+    assert codes(check(capsys, tmp_path / "take-fixed")[1]) == []
+    write(take, {}, boundary_colours={"border": "#ffc400"})
+    assert codes(check(capsys, take)[1]) == [], "a paint that is on any border"
+    (take / "template.npz").write_bytes(b"no template")
+    (finding,) = check(capsys, take)[1]["findings"]
+    assert (finding["code"], finding["severity"]) == ("template", "error")
+    assert "template.npz" in finding["found"]
+
+
+def test_files_that_no_stage_takes_are_named(
+    sound: dict[int, Scan], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    take = write(tmp_path / "take", sound, frames=[10, 11, 12], dropped_frames=[13])
+    write_mesh(take / "scans" / "calibration.ply", sound[10].mesh)
+    code, found = check(capsys, take)
+    assert (code, codes(found)) == (0, [])
+    assert found["unlisted"] == ["000014.ply", "calibration.ply"], "13 is said to be left out"
+    assert run("check", take, "--workers", "1") == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "Beside the frames, taken by no stage: 2 files, 000014.ply, calibration.ply" in said
+
+
 def test_a_bare_template_is_placed_as_the_scans_are(
     sound: dict[int, Scan], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    take = write(tmp_path / "take", moved(sound, 1000 * TURN))
+    take = write(tmp_path / "take", moved(sound, 1000 * TURN), boundary_colours={"border_0": "#ffc400"})
     for scan in moved({0: sound[10]}, 1000 * TURN).values():
-        write_mesh(take / "template.obj", scan.mesh)
+        write_mesh(take / "template.obj", opened(scan.mesh))
     assert set(codes(check(capsys, take, "--fix")[1])) == {"units", "axes"}
     fixed = read_mesh(tmp_path / "take-fixed" / "template.obj").mesh
     np.testing.assert_allclose(fixed.vertices, sound[10].mesh.vertices, atol=1e-4)
-    np.testing.assert_array_equal(fixed.faces, sound[10].mesh.faces)
+    np.testing.assert_array_equal(fixed.faces, opened(sound[10].mesh).faces)
 
 
 def test_what_the_command_line_says_is_kept(sound: dict[int, Scan], tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -10,10 +11,12 @@ import pytest
 from capture4d.body.anny import load_anny
 from capture4d.body.skinning import PosedBody, pose_frame, with_shape
 from capture4d.captures.placement import place
+from capture4d.files.atomic import write_json
 from capture4d.files.records import load_garment, save_poses
 from capture4d.geometry.mesh import vertex_normals
 from capture4d.mesh_files.meshes import write_mesh
 from capture4d.templates.body_regions import body_region
+from capture4d.templates.config import Axis
 from capture4d.templates.garment import make_template
 from capture4d.templates.placing import axis_name, find_placement
 from capture4d.types import Mesh
@@ -59,8 +62,8 @@ def test_units_and_axes_are_found(worn: tuple[Mesh, PosedBody], turn: str, unit:
     np.testing.assert_array_equal(told.placement.axes, found.placement.axes)
 
 
-def _file_axis(row: np.ndarray):
-    return axis_name(row).lower().removeprefix("+")
+def _file_axis(row: np.ndarray) -> Axis:
+    return next(axis for axis in get_args(Axis) if axis_name(row) in (axis.upper(), f"+{axis.upper()}"))
 
 
 def test_what_is_said_is_not_doubted(worn: tuple[Mesh, PosedBody]) -> None:
@@ -76,11 +79,12 @@ def test_the_command_says_how_it_read_a_mesh(tmp_path: Path, worn: tuple[Mesh, P
     poses = scripted_clip(person, CLIPS["range-of-motion"], 60.0, 2, np.random.default_rng(0))
     save_poses(tmp_path / "poses.npz", poses)
     arguments = ("--poses", tmp_path / "poses.npz")
+    write_json(tmp_path / "capture.json", {"boundary_colours": {"bottom": "#ffc400", "neck": "#c81e96"}})
     templates = []
-    for name, turn, unit in (("plain", np.eye(3), "m"), ("turned", TURNS["Z up"], "mm")):
+    for name, turn, metres in (("plain", np.eye(3), 1.0), ("turned", TURNS["Z up"], 0.001)):
         write_mesh(
             tmp_path / f"{name}.obj",
-            mesh.with_vertices((mesh.vertices @ turn.T / METRES[unit]).astype(np.float32)),
+            mesh.with_vertices((mesh.vertices @ turn.T / metres).astype(np.float32)),
         )
         output = tmp_path / f"{name}.npz"
         assert run("template", tmp_path / f"{name}.obj", "--output", output, *arguments) == 0
@@ -89,4 +93,5 @@ def test_the_command_says_how_it_read_a_mesh(tmp_path: Path, worn: tuple[Mesh, P
     assert out.count("so it lies on the body") == 1
     assert "read in mm, up is +Z, front is -Y: so it lies on the body" in out
     assert "UVs: cut afresh (no UVs); they are no sewing pattern, so lengths of the cloth are those of the mesh" in out
+    assert "boundary_colours names bottom, which the template does not have; rename the paints there" in out
     np.testing.assert_allclose(templates[1].vertices, templates[0].vertices, atol=2e-5)

@@ -1,0 +1,1 @@
+"""The take again, without what is safely repaired."""
