@@ -107,7 +107,7 @@ class LossConfig:
 
 @settings
 class AugmentationConfig:
-    """Changes of the training pairs. Flips and crops would break the UVs and are not among them."""
+    """Changes of the training pairs. Flips would break the UVs and are not among them."""
 
     turn_deg: NonNegative = 0.0
     """Standard deviation of a common rotation of low and high normals about the vertical."""
@@ -151,9 +151,9 @@ class WrinkleConfig:
     """Frames between the two that belong to neither; neighbours are too alike."""
     texels: Count = 256
     """Side of the maps to learn; pairs are halved until they fit."""
-    crop: Whole = 0
-    """Side of the squares of them that a step learns from, wherever they lie; 0: whole maps. Maps are then made from
-    squares that overlap."""
+    crop: Count | None = None
+    """Side of the squares of them that a step learns from, wherever they lie; whole maps if absent. Maps are then made
+    from squares that overlap."""
     network: NetworkConfig = field(default_factory=NetworkConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)

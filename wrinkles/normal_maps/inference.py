@@ -41,7 +41,7 @@ class WrinkleModel:
         config: NetworkConfig,
         *,
         texels: int,
-        crop: int = 0,
+        crop: int | None = None,
         maps: MapConfig,
         layout_digest: str,
         template: Mesh,
@@ -51,7 +51,7 @@ class WrinkleModel:
         self.texels = texels
         """Side of the maps the generator learned from."""
         self.crop = crop
-        """Side of the squares of them that it sees; 0: it sees them whole."""
+        """Side of the squares of them that it sees; None: it sees them whole."""
         self.maps = maps
         """Of the maps on disk."""
         self.layout_digest = layout_digest
@@ -104,12 +104,12 @@ class WrinkleModel:
         return self._narrow
 
 
-def answer(network: UNet, seen: Tensor, low: Tensor, *, crop: int) -> Tensor:
+def answer(network: UNet, seen: Tensor, low: Tensor, *, crop: int | None) -> Tensor:
     """A network's maps, full precision, not yet of unit length.
 
     Args:
         seen: low maps in the network's precision; `low`, the same in full precision.
-        crop: side of the squares that it learned from; 0: whole maps.
+        crop: side of the squares that it learned from; None: whole maps.
     """
     painted = (_by_tiles(network.paint, seen, side=crop) if crop else network.paint(seen)).float()
     return low + painted if network.output == "residual" else painted
@@ -195,7 +195,8 @@ def load_model(path: str | PathLike[str]) -> WrinkleModel:
         faces = file.get(FACES)
         template = Mesh(file[VERTICES], np.zeros((0, 3), np.int32) if faces is None else faces, file.get(UV))
         texels = whole(file.entry("texels"), "texels", least=1)
-        crop = whole(file.entry("crop"), "crop") if "crop" in file.note else 0  # early versions saw maps whole
+        crop = file.note.get("crop")  # early versions saw maps whole
+        crop = None if crop is None else whole(crop, "crop", least=1, most=texels)
         layout = text(file.entry("layout_digest"), "layout_digest")
         if config.layers > len(weights):
             raise InputError(f"expected weights of {config.layers} layers, found {len(weights)} tensors")

@@ -120,13 +120,13 @@ def consecutive_pairs(takes: Sequence[PairTake]) -> list[tuple[int, int]]:
     return pairs
 
 
-def batches(takes: Sequence[PairTake], *, size: int, seed: int, start: int, crop: int = 0) -> Iterator[Batch]:
+def batches(takes: Sequence[PairTake], *, size: int, seed: int, start: int, crop: int | None = None) -> Iterator[Batch]:
     """Random consecutive pairs without end, each once an epoch; batch `start` is the first.
 
     The same seed gives the same batches, wherever one starts.
 
     Args:
-        crop: side of a square of each map, around a texel that is known; 0: the whole map.
+        crop: side of a square of each map, around a texel that is known; None: the whole map.
     """
     pairs = consecutive_pairs(takes)
     position = start * size
