@@ -84,7 +84,7 @@ def lesson(config: TrainingSetConfig, folder: Path, *, truth: bool, tracked: boo
         else:
             (work,) = registered_takes(config, folder, [name], tracked=tracked, workers=workers)
             body, poses = open_work(work).require_posed_body()
-            good = np.array([record["verdict"] == "good" for record in load_records(work / "registration")])
+            good = np.array([record["verdict"] != "failed" for record in load_records(work / "registration")])
             sequences.append((load_registration(work / "registration"), with_shape(body, poses.shape), poses, good))
     learned = learned_takes(config)
     shapes = [poses.shape for name, (_, _, poses, _) in zip(names, sequences, strict=True) if name in learned]

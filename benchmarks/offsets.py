@@ -137,7 +137,7 @@ def _frames(layout: OffsetLayout, work: Path, joints: np.ndarray, *, good_only: 
     rows = PoseRows.match(sequence, with_shape(body, poses.shape), poses)
     frames = offset_frames(layout, body, rows.poses, np.array(sequence.vertices), joints)
     records = load_records(work / "registration")
-    return frames.rows([row for row, each in enumerate(records) if each["verdict"] == "good" or not good_only])
+    return frames.rows([row for row, each in enumerate(records) if each["verdict"] != "failed" or not good_only])
 
 
 def _joined(parts: list[OffsetFrames]) -> OffsetFrames:

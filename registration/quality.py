@@ -302,7 +302,7 @@ def _doubts_of_regions(
     """What an eye would stop at, the worst region of each kind; the others are counted."""
     doubts = []
     for key, limit, what in (
-        ("fit_beyond_percent", config.region_far_percent, f"of it beyond {FAR_MM * length_factor:g} mm"),
+        ("fit_beyond_percent", config.region_far_percent, f"of its vertices beyond {FAR_MM * length_factor:g} mm"),
         ("cut_percent", config.region_cut_percent, "of its faces cut others"),
         ("creased_percent", config.region_creased_percent, "of its edges are creased"),
     ):

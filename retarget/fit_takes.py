@@ -177,4 +177,6 @@ def _unposed(take: RegisteredTake, record: dict[str, list]) -> Take:
     shaped, frame_ids = with_shape(take.body, take.poses.shape), np.array(record["frames"], np.int32)
     rows = PoseRows.of_frames(frame_ids, take.garment, shaped, take.poses)
     transforms = np.stack([rows.transforms(row) for row in range(len(frame_ids))])
-    return Take(take.name, rows.poses, np.array([each == "good" for each in record["verdicts"]]), transforms)
+    # a frame to be checked is whole: what its scan does not show weighs little, and crumpled cloth is cloth
+    usable = np.array([each != "failed" for each in record["verdicts"]])
+    return Take(take.name, rows.poses, usable, transforms)

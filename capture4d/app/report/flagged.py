@@ -14,7 +14,8 @@ from capture4d.captures.frame_ranges import frame_ranges
 __all__ = ["FLAGGED_NOTE", "flagged_table", "verdict_counts", "verdict_runs"]
 
 FLAGGED_NOTE = "Frames with the same reasons share a row; its figures are those of the worst of them."
-NUMBER = re.compile(r"\d+(\.\d+)?(e[+-]?\d+)?")
+DETAIL = re.compile(r", and in \d+ more|\b(left|right) |\d+(\.\d+)?(e[+-]?\d+)?")
+"""What differs between reasons of one kind: how much, on which side, how often."""
 WORST_FIRST = ("failed", "lost", "check")
 
 
@@ -31,7 +32,7 @@ def flagged_table(
     groups: dict[tuple[str, tuple[str, ...]], list[Mapping[str, Any]]] = {}
     for record in records:
         if record["verdict"] != "good":
-            kinds = tuple(NUMBER.sub("", reason) for reason in record["reasons"])
+            kinds = tuple(DETAIL.sub("", reason) for reason in record["reasons"])
             groups.setdefault((record["verdict"], kinds), []).append(record)
     by = worst_by if worst_by is not None else next((key for _, key in measures), None)
     order = sorted(

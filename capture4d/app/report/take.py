@@ -258,15 +258,14 @@ def _film_row(scene: _Scene, job: _DrawJob) -> tuple[int, np.ndarray]:
     row, registered, (scale,) = job.row, scene.work.registered, job.scales
     vertices, template = np.array(registered.vertices[row]), registered.garment.template
     views = [job.framing.view(vertices, direction) for direction in VIEWS]
-    size = {"width": FILM_WIDTH, "height": FILM_WIDTH * HEIGHT // WIDTH}
+    width, height = FILM_WIDTH, FILM_WIDTH * HEIGHT // WIDTH
     scan = readable_scan(scene.capture, int(registered.frame_ids[row]))
-    scanned = [] if scan is None else [Drawn(scan.mesh, scan.colours)]
-    front, back = (trace([template.with_vertices(vertices)], view, **size) for view in views)
+    drawn = [] if scan is None else [Drawn(scan.mesh, scan.colours)]
+    front, back = (trace([template.with_vertices(vertices)], view, width=width, height=height) for view in views)
+    scanned = render(drawn, views[0], width=width, height=height)
     heat = heat_colours(1e3 * registered.residual_m[row].astype(float), high=scale.high)
     cloth = checks(template)
-    return row, tiled(
-        [[render(scanned, views[0], **size), front.painted([cloth])], [back.painted([cloth]), front.painted([heat])]]
-    )
+    return row, tiled([[scanned, front.painted([cloth])], [back.painted([cloth]), front.painted([heat])]])
 
 
 def _drawn_rows(records: Sequence[Mapping[str, Any]], count: int) -> list[int]:

@@ -33,6 +33,13 @@ def test_a_frame_without_the_measure_does_not_hide_others():
     assert table.rows == [["1-2", Badge("lost"), "in 2: a"]]
 
 
+def test_sides_and_further_regions_do_not_part_what_is_of_one_kind():
+    left = "left armpit: 14.9 % of its faces cut others > 12 %"
+    right = "right armpit: 16.2 % of its faces cut others > 12 %, and in 1 more"
+    table = flagged_table([record(1, "check", left), record(2, "check", right), record(3, "check", left + "; x")])
+    assert [row[0] for row in table.rows] == ["1-2", "3"]
+
+
 def test_a_take_without_faults_has_no_rows():
     assert flagged_table(TAKE[:1]).rows == []
 
