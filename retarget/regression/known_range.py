@@ -132,7 +132,7 @@ class Trust:
         """As frames that were not learned from show it: the share with which answers come nearest to the truth.
 
         Frames at like distances are told together, by least squares; shares that would rise with the distance are
-        levelled (isotonic regression).
+        levelled (isotonic regression). A learned pose itself is believed whole.
         """
         count = min(len(distances_deg) // TRUST_FRAMES, MOST_KNOTS)
         if not count:
@@ -147,7 +147,7 @@ class Trust:
                 last = levels.pop()
                 levels[-1] = [a + b for a, b in zip(levels[-1], last, strict=True)]
         shares = [np.clip(level[1] / level[2], 0, 1) for level in levels for _ in range(int(level[0]))]
-        return Trust(np.column_stack([groups, shares]).astype(np.float32))
+        return Trust(np.column_stack([[0.0, *groups], [1.0, *shares]]).astype(np.float32))
 
     def at(self, degrees: Float64[np.ndarray, " frames"]) -> Float64[np.ndarray, " frames"]:
         return np.interp(degrees, self.knots[:, 0], self.knots[:, 1])
