@@ -87,7 +87,7 @@ def run(
         garment = load_garment_model(model.folder)
         for who in (None, HEAVY):
             person = garment.person(who)
-            motions = dict(unseen_motions(person, garment.model.fps, count))
+            motions = dict(unseen_motions(person, garment.model.fps, count // 2 if quick else count))
             for path in recorded:
                 motions[path.stem] = _first(read_motion(path, garment.body, fps=garment.model.fps), count)
             for name, poses in motions.items():

@@ -42,6 +42,7 @@ from retarget.regression.learning import (
     UnposedTakes,
     examined,
     fitting_clips,
+    garment_at_rest,
     learn_shapes,
     predictions,
     regression_clips,
@@ -51,7 +52,7 @@ from retarget.regression.learning import (
 from retarget.regression.linear import LinearRegressor, fit_linear, save_linear
 from retarget.regression.regressors import FittingClips, Regressor, mean_squared_error
 from retarget.regression.splits import ROLES, Piece, split_takes
-from retarget.shapes.blendshapes import ShapeSpace, as_model_arrays, shape_space, worst_errors
+from retarget.shapes.blendshapes import ShapeSpace, as_model_arrays, project, shape_space, worst_errors
 from retarget.shapes.files import load_blendshapes, save_blendshapes
 from retarget.shapes.mirroring import Mirror, find_mirror
 
@@ -204,7 +205,9 @@ def _regressors(
     clips = fitting_clips(lesson.takes, lesson.pieces, layout, space, mirror, projected)
     linear = fit_linear(clips, layout, space.std, config.linear)
     save_linear(stage.path / LINEAR, linear, model_digest=digest)
-    known_shapes = CoefficientRange.of(clips.all, space.std)
+    known_shapes = replace(
+        CoefficientRange.of(clips.all, space.std), resting=garment_at_rest(clips, _template_shape(stage, space))
+    )
     chosen = replace(config.linear, ridges=(linear.ridge,))
     trust = examined(clips, layout, known_shapes, lambda known: fit_linear(known, layout, space.std, chosen))
     ranges = {"linear": replace(ControlRange.of(clips.all, layout), trust=trust)}
@@ -225,6 +228,7 @@ def _regressors(
     save_known_range(stage.path / POSES, known, model_digest=digest)
     note: dict[str, Any] = {
         "mirrored": mirror is not None,
+        "fades_to": "mean" if known_shapes.resting is None else "template",
         "control_numbers": layout.size,
         "joints": [layout.joint_names[j] for j in layout.joints],
     }
@@ -235,6 +239,12 @@ def _regressors(
         if name in ranges:
             note[name]["trust"] = [{"degrees": degrees, "share": share} for degrees, share in ranges[name].trust.knots]
     return note
+
+
+def _template_shape(stage: Stage, space: ShapeSpace) -> Float32[np.ndarray, " shapes"]:
+    """The coefficients that come nearest to the template on the person of the takes."""
+    template = load_blendshapes(stage.path / MODEL).garment.template.vertices
+    return project(space, template[None], np.ones((1, len(template)), np.float32))[0].astype(np.float32)
 
 
 def _untuned(config: KernelConfig, ridge: float) -> KernelConfig:

@@ -114,7 +114,7 @@ class _Worn:
 
 
 class LimbSurfaces:
-    """A posed body as one garment sees it; it remembers the faces that it found last, where the next search begins."""
+    """A posed body as one garment sees it; of `contacts` it remembers which faces the vertices are over."""
 
     def __init__(self, worn: _Worn, vertices: Float[np.ndarray, "skin 3"], start: Int32[np.ndarray, " verts"]) -> None:
         self._worn, self._start, self._at = worn, start, start
@@ -134,13 +134,13 @@ class LimbSurfaces:
         """Heights over the limb that carries a vertex beside each point, metres, negative inside."""
         return self._over(points, self._at[vertices])[0]
 
-    def contacts(self, points: Float[np.ndarray, "verts 3"], *, afresh: bool = False) -> Contacts:
+    def contacts(self, points: Float[np.ndarray, "verts 3"]) -> Contacts:
         """Where the garment's vertices are between the limbs.
 
-        Args:
-            afresh: search from the skin under the garment at rest.
+        Every walk begins at the skin under the garment at rest: from where the last one ended it would creep, search by
+        search, over the armpit from one limb to the other.
         """
-        heights, normals, feet, self._at = self._over(points, self._start if afresh else self._at)
+        heights, normals, feet, self._at = self._over(points, self._start)
         far = heights > LEAVING_M / 2
         outwards = np.where(far[:, None], (points - feet) / np.maximum(heights, LEAVING_M / 2)[:, None], normals)
         room, overlapping = np.full(len(points), np.inf), np.zeros(len(points), bool)

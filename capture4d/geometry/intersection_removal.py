@@ -98,12 +98,8 @@ class Contacts:
 class Surroundings(Protocol):
     """A posed body, as one garment sees it."""
 
-    def contacts(self, points: Float[np.ndarray, "verts 3"], *, afresh: bool = False) -> Contacts:
-        """Of the garment's vertices, wherever they are by now.
-
-        Args:
-            afresh: search without memory of where they were.
-        """
+    def contacts(self, points: Float[np.ndarray, "verts 3"]) -> Contacts:
+        """Of the garment's vertices, wherever they are by now."""
         ...
 
     def heights(
@@ -180,14 +176,14 @@ class IntersectionRemoval:
     def __call__(self, vertices: Float[np.ndarray, "verts 3"], body: Surroundings) -> Removed:
         """Move a garment, metres, out of a body; and draw its edges together."""
         start = np.ascontiguousarray(vertices, np.float64)
-        found = body.contacts(start, afresh=True)
+        found = body.contacts(start)
         before, was_inside = Penetration.of(found), found.depths > NOISE_M
         result = self._settled(start, found, body)
-        last = body.contacts(result, afresh=True)
+        last = body.contacts(result)
         if self._config.enabled and (last.heights < 0).any():
             out = np.maximum(-last.heights, 0.0)
             result = result + (out + NOISE_M * (out > 0))[:, None] * last.normals
-            last = body.contacts(result, afresh=True)
+            last = body.contacts(result)
         outwards = doubled_area_vectors(result, self._faces)
         flipped = (np.einsum("fx,fcx->fc", outwards, last.normals[self._faces]) < 0).all(axis=1)
         flipped &= ~last.overlapping[self._faces].any(axis=1)
@@ -232,7 +228,8 @@ class IntersectionRemoval:
         beside = np.repeat(corners[:, 0], len(EDGE_MIDDLES))
         deepest = body.heights(probes, beside).reshape(len(near), -1).min(axis=1)
         through = (deepest < 0) & (deepest > -bulges[near])
-        wanted = found.heights[corners[through]] + (margin - deepest[through])[:, None]
+        wanted = np.minimum(found.heights[corners[through]] + (margin - deepest[through])[:, None],
+                            margin + bulges[near[through], None])  # fmt: skip
         np.maximum.at(lifts, corners[through], wanted)
         return lifts
 

@@ -27,7 +27,7 @@ from capture4d.files.reading import reading, shortened
 from capture4d.files.tensors import TensorFile, read_tensors, write_tensors
 from capture4d.types import PoseSequence
 from retarget.regression.controls import ControlLayout
-from retarget.regression.regressors import Clip, Regressor, good_frames
+from retarget.regression.regressors import Clip, Regressor, Trust, good_frames
 
 __all__ = [
     "BoundedRegressor",
@@ -35,7 +35,6 @@ __all__ = [
     "ControlRange",
     "KnownRange",
     "PoseRange",
-    "Trust",
     "load_known_range",
     "nearest_poses",
     "pose_quaternions",
@@ -59,10 +58,6 @@ NEAREST_SHARE = 0.15
 then moves without jumps."""
 NUMBERS_OF_A_RADIAN = np.sqrt(4 / 3)
 """Length, on average over axes, of the change of two columns of a rotation matrix, for each radian of a small turn."""
-TRUST_FRAMES, MOST_KNOTS = 12, 12
-"""Frames at like distances from which a share of trust is told, at least; and how often, at most."""
-HALF_RIGHT = 0.5
-"""A share of trust down to which a distance counts as safe."""
 LEAST_MOTION = {"velocity": 0.1, "acceleration": 1.0, "turning": 0.5}
 """Motion that is always taken for known: m/s, m/s^2, rad/s; a hand's breadth at arm's length."""
 
@@ -109,54 +104,6 @@ def nearest_poses(
 
 
 # --- controls ----------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Trust:
-    """What share of its answers a regressor is believed, by how far a pose is from every learned one."""
-
-    knots: Float32[np.ndarray, "knots 2"]
-    """Degrees, ascending, and shares from 1 to 0, not ascending; between them it is linear, beyond them level."""
-
-    @staticmethod
-    def whole() -> Trust:
-        """Of a regressor that was never examined."""
-        return Trust(np.array([[0.0, 1.0]], np.float32))
-
-    @staticmethod
-    def of(
-        distances_deg: Float64[np.ndarray, " frames"],
-        answers: Float[np.ndarray, "frames shapes"],
-        truth: Float[np.ndarray, "frames shapes"],
-    ) -> Trust:
-        """As frames that were not learned from show it: the share with which answers come nearest to the truth.
-
-        Frames at like distances are told together, by least squares; shares that would rise with the distance are
-        levelled (isotonic regression).
-        """
-        count = min(len(distances_deg) // TRUST_FRAMES, MOST_KNOTS)
-        if not count:
-            return Trust.whole()
-        levels: list[list[float]] = []  # degrees, <answer, truth> and <answer, answer> of neighbouring groups
-        groups: list[float] = []
-        for rows in np.array_split(np.argsort(distances_deg, kind="stable"), count):
-            said, true = answers[rows].astype(np.float64), truth[rows].astype(np.float64)
-            groups.append(float(distances_deg[rows].mean()))
-            levels.append([1, float((said * true).sum()), float((said**2).sum()) + 1e-12])
-            while len(levels) > 1 and levels[-1][1] / levels[-1][2] > levels[-2][1] / levels[-2][2]:
-                last = levels.pop()
-                levels[-1] = [a + b for a, b in zip(levels[-1], last, strict=True)]
-        shares = [np.clip(level[1] / level[2], 0, 1) for level in levels for _ in range(int(level[0]))]
-        return Trust(np.column_stack([groups, shares]).astype(np.float32))
-
-    def at(self, degrees: Float64[np.ndarray, " frames"]) -> Float64[np.ndarray, " frames"]:
-        return np.interp(degrees, self.knots[:, 0], self.knots[:, 1])
-
-    @property
-    def reach_deg(self) -> float:
-        """The farthest distance at which answers were at least half right; 0 if there is none."""
-        right = self.knots[self.knots[:, 1] >= HALF_RIGHT, 0]
-        return float(right.max(initial=0.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -266,6 +213,15 @@ class CoefficientRange:
     """Of each coefficient's size."""
     length: float
     """The largest length of a frame's coefficients, each over its standard deviation."""
+    resting: Float32[np.ndarray, " shapes"] | None = None
+    """The garment that is left where no answer is believed; None is the mean garment."""
+
+    def faded(
+        self, answers: Float[np.ndarray, "frames shapes"], trust: Float64[np.ndarray, " frames"]
+    ) -> Float32[np.ndarray, "frames shapes"]:
+        """Answers within what was learned, faded towards the garment at rest."""
+        resting = 0.0 if self.resting is None else self.resting
+        return (resting + trust[:, None] * (self.inside(answers) - resting)).astype(np.float32)
 
     @staticmethod
     def of(clips: Sequence[Clip], std: Float[np.ndarray, " shapes"]) -> CoefficientRange:
@@ -313,8 +269,8 @@ class BoundedRegressor:
     def believed(
         self, answers: Float32[np.ndarray, "frames shapes"], trust: Float64[np.ndarray, " frames"]
     ) -> Float32[np.ndarray, "frames shapes"]:
-        """Answers within what was learned, faded towards the mean garment."""
-        return self.coefficients.inside(trust[:, None] * answers)
+        """Answers within what was learned, faded towards the garment at rest."""
+        return self.coefficients.faded(answers, trust)
 
 
 class BoundedStream:
@@ -369,7 +325,10 @@ class KnownRange:
 
 def save_known_range(path: Path, known: KnownRange, *, model_digest: str) -> None:
     poses, coefficients = known.poses, known.coefficients
-    tensors = {"quaternions": poses.quaternions, "std": coefficients.std, "largest": coefficients.largest}
+    resting = np.zeros_like(coefficients.std) if coefficients.resting is None else coefficients.resting
+    tensors = {
+        "quaternions": poses.quaternions, "std": coefficients.std, "largest": coefficients.largest, "resting": resting,
+    }  # fmt: skip
     for name, controls in known.controls.items():
         tensors |= {f"{name}.{part}": getattr(controls, part) for part in ("mean", "largest", "poses")}
         tensors[f"{name}.trust"] = controls.trust.knots
@@ -436,9 +395,11 @@ def _control_range(file: TensorFile, name: str) -> ControlRange:
 
 
 def _coefficient_range(file: TensorFile) -> CoefficientRange:
-    std, largest = file["std"], file["largest"]
-    if std.ndim != 1 or std.shape != largest.shape or not (np.isfinite(std).all() and np.isfinite(largest).all()):
-        raise InputError(f"expected a finite range for each coefficient, found {std.shape} and {largest.shape}, or NaN")
+    std, largest, resting = file["std"], file["largest"], file["resting"]
+    finite = all(np.isfinite(each).all() for each in (std, largest, resting))
+    if std.ndim != 1 or not std.shape == largest.shape == resting.shape or not finite:
+        found = f"{std.shape}, {largest.shape} and {resting.shape}"
+        raise InputError(f"expected a finite range for each coefficient, found {found}, or NaN")
     if std.min(initial=1) <= 0 or largest.min(initial=0) < 0:
         raise InputError("expected positive standard deviations and sizes from 0, found others")
-    return CoefficientRange(std, largest, _amount(file, "length"))
+    return CoefficientRange(std, largest, _amount(file, "length"), resting)

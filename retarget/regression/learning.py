@@ -18,11 +18,10 @@ from retarget.regression.known_range import (
     CoefficientRange,
     ControlRange,
     PoseRange,
-    Trust,
     nearest_poses,
     pose_quaternions,
 )
-from retarget.regression.regressors import Clip, FittingClips, Regressor
+from retarget.regression.regressors import Clip, FittingClips, Regressor, Trust
 from retarget.regression.splits import Piece, Role
 from retarget.shapes.blendshapes import (
     ShapeSpace,
@@ -39,6 +38,7 @@ __all__ = [
     "UnposedTakes",
     "examined",
     "fitting_clips",
+    "garment_at_rest",
     "learn_shapes",
     "predictions",
     "regression_clips",
@@ -235,25 +235,50 @@ def examined(
     Args:
         fit: learns from clips, with settings that are chosen already.
     """
-    takes = sorted({clip.take for clip in clips.all})
-    folds = [
-        ([clip for clip in clips.all if clip.take != take], [clip for clip in clips.all if clip.take == take])
-        for take in takes
-    ]
-    parts = folds if len(takes) > 1 else [(clips.training, clips.validation)]
+    resting = 0.0 if coefficients.resting is None else coefficients.resting
     distances, answers, truth = [], [], []
-    for known, asked in parts:
+    for known, asked in _left_out(clips):
         if sum(int(clip.good.sum()) for clip in known) < LEAST_TAUGHT:
             continue
         learned, reach = fit(FittingClips(known, (), known)), ControlRange.of(known, layout)
         for clip in asked:
             controls, _ = reach.bounded(clip.controls, layout, np.inf)
             distances.append(reach.distances(clip.controls, layout)[clip.good])
-            answers.append(coefficients.inside(learned.predict(controls))[clip.good])
-            truth.append(clip.coefficients[clip.good])
+            answers.append(coefficients.inside(learned.predict(controls))[clip.good] - resting)
+            truth.append(clip.coefficients[clip.good] - resting)
     if not distances:
         return Trust.whole()
     return Trust.of(np.concatenate(distances), np.concatenate(answers), np.concatenate(truth))
+
+
+def garment_at_rest(
+    clips: FittingClips, template: Float32[np.ndarray, " shapes"]
+) -> Float32[np.ndarray, " shapes"] | None:
+    """What is left where no answer is believed: the template, if takes that were left out are nearer to it than to the
+    mean of the others; else the mean garment, None.
+
+    Args:
+        template: its coefficients, on the person of the takes.
+    """
+    errors = np.zeros(2)
+    for known, asked in _left_out(clips):
+        learned = [clip.coefficients[clip.good] for clip in known if clip.good.any()]
+        truth = [clip.coefficients[clip.good] for clip in asked if clip.good.any()]
+        if learned and truth:
+            mean, true = np.concatenate(learned).mean(axis=0), np.concatenate(truth).astype(np.float64)
+            errors += ((true - mean) ** 2).sum(), ((true - template) ** 2).sum()
+    return template if errors[1] < errors[0] else None
+
+
+def _left_out(clips: FittingClips) -> list[tuple[Sequence[Clip], Sequence[Clip]]]:
+    """What is learned from, and what is examined: each take in turn, by the others; of an only take, its end."""
+    takes = sorted({clip.take for clip in clips.all})
+    if len(takes) < 2:
+        return [(clips.training, clips.validation)]
+    return [
+        ([clip for clip in clips.all if clip.take != take], [clip for clip in clips.all if clip.take == take])
+        for take in takes
+    ]
 
 
 def _learned_pieces(pieces: Sequence[Piece]) -> tuple[list[Piece], list[Piece]]:

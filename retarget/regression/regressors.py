@@ -31,6 +31,7 @@ __all__ = [
     "Regressor",
     "Scales",
     "Stream",
+    "Trust",
     "good_frames",
     "mean_squared_error",
     "read_regressor",
@@ -60,6 +61,10 @@ RESPONSE_RIDGE = 0.3
 """Penalty of the regression that says what a control counts, relative to the variance of a standardised control."""
 LEAST_RESPONSE = 0.02
 """A control counts at least this share of the mean of all."""
+TRUST_FRAMES, MOST_KNOTS = 12, 12
+"""Frames at like distances from which a share of trust is told, at least; and how often, at most."""
+HALF_RIGHT = 0.5
+"""A share of trust down to which a distance counts as safe."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,6 +98,54 @@ class FittingClips:
     def settled(self) -> FittingClips:
         """The training clips alone, with nothing left to choose."""
         return FittingClips(self.training, (), self.training)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trust:
+    """What share of its answers a regressor is believed, by how far a pose is from every learned one."""
+
+    knots: Float32[np.ndarray, "knots 2"]
+    """Degrees, ascending, and shares from 1 to 0, not ascending; between them it is linear, beyond them level."""
+
+    @staticmethod
+    def whole() -> Trust:
+        """Of a regressor that was never examined."""
+        return Trust(np.array([[0.0, 1.0]], np.float32))
+
+    @staticmethod
+    def of(
+        distances_deg: Float64[np.ndarray, " frames"],
+        answers: Float[np.ndarray, "frames shapes"],
+        truth: Float[np.ndarray, "frames shapes"],
+    ) -> Trust:
+        """As frames that were not learned from show it: the share with which answers come nearest to the truth.
+
+        Frames at like distances are told together, by least squares; shares that would rise with the distance are
+        levelled (isotonic regression). A learned pose itself is believed whole.
+        """
+        count = min(len(distances_deg) // TRUST_FRAMES, MOST_KNOTS)
+        if not count:
+            return Trust.whole()
+        levels: list[list[float]] = []  # degrees, <answer, truth> and <answer, answer> of neighbouring groups
+        groups: list[float] = []
+        for rows in np.array_split(np.argsort(distances_deg, kind="stable"), count):
+            said, true = answers[rows].astype(np.float64), truth[rows].astype(np.float64)
+            groups.append(float(distances_deg[rows].mean()))
+            levels.append([1, float((said * true).sum()), float((said**2).sum()) + 1e-12])
+            while len(levels) > 1 and levels[-1][1] / levels[-1][2] > levels[-2][1] / levels[-2][2]:
+                last = levels.pop()
+                levels[-1] = [a + b for a, b in zip(levels[-1], last, strict=True)]
+        shares = [np.clip(level[1] / level[2], 0, 1) for level in levels for _ in range(int(level[0]))]
+        return Trust(np.column_stack([[0.0, *groups], [1.0, *shares]]).astype(np.float32))
+
+    def at(self, degrees: Float64[np.ndarray, " frames"]) -> Float64[np.ndarray, " frames"]:
+        return np.interp(degrees, self.knots[:, 0], self.knots[:, 1])
+
+    @property
+    def reach_deg(self) -> float:
+        """The farthest distance at which answers were at least half right; 0 if there is none."""
+        right = self.knots[self.knots[:, 1] >= HALF_RIGHT, 0]
+        return float(right.max(initial=0.0))
 
 
 @runtime_checkable

@@ -27,7 +27,7 @@ class Cylinder:
     radius: float = 0.1
     wall_z: float = np.inf
 
-    def contacts(self, points: np.ndarray, *, afresh: bool = False) -> Contacts:
+    def contacts(self, points: np.ndarray) -> Contacts:
         flat = points * (1.0, 0.0, 1.0)
         distance = np.linalg.norm(flat, axis=1)
         normals = flat / distance[:, None]

@@ -20,12 +20,11 @@ from retarget.regression.known_range import (
     ControlRange,
     KnownRange,
     PoseRange,
-    Trust,
     load_known_range,
     pose_quaternions,
     save_known_range,
 )
-from retarget.regression.regressors import Clip
+from retarget.regression.regressors import Clip, Trust
 
 SAFE_DEG = 10.0
 LAYOUTS = {
@@ -184,6 +183,15 @@ def test_answers_are_believed_by_the_share_that_was_shown(bounded, layout, motio
     near = inside.all(axis=1) & (np.linalg.norm(raw / bounded.coefficients.std, axis=1) < bounded.coefficients.length)
     assert near.any()
     np.testing.assert_allclose(doubtful.predict(controls)[near], 0.5 * whole[near], atol=1e-5)
+
+
+def test_answers_fade_to_the_garment_at_rest(bounded, layout, motion) -> None:
+    resting = np.float32([0.3, -0.2, 0.1])
+    fading = replace(bounded, coefficients=replace(bounded.coefficients, resting=resting))
+    far = control_vectors(layout, turned(turned(motion(5, 4), 120.0), 120.0, 2))
+    np.testing.assert_allclose(fading.predict(far), np.tile(resting, (5, 1)), atol=1e-6)
+    near = control_vectors(layout, motion(80, 4))
+    np.testing.assert_allclose(fading.predict(near), bounded.predict(near), atol=1e-6)
 
 
 def test_it_comes_back_from_its_file(bounded, layout, motion, tmp_path: Path) -> None:
