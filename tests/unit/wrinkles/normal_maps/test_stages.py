@@ -314,7 +314,7 @@ def test_sizes_that_cannot_be_are_one_line(work: Path, trained: Path, tmp_path: 
     assert "--texels: expected the 64 of --pairs.map.size, or one of the two alone, found 128" in line
     line = fails(capsys, *train(work, tmp_path / "x", "--crop", "48"))
     assert "crop: expected at most the 32 texels of the maps, found 48" in line
-    assert run("wrinkles", "maps", work, "--texels", "64", "--workers", "1") == 0
+    assert run("wrinkles", "maps", work, "--texels", "64", "--overwrite", "--workers", "1") == 0
     assert read_json(work / "wrinkles" / "pairs" / "stage.json")["config"]["map"]["padding"] == 1
     line = fails(capsys, "wrinkles", "train", work, "--output", tmp_path / "x", "--texels", "128", "--workers", "1")
     assert (
