@@ -19,7 +19,7 @@ def chosen_frames(text: str, frame_ids: Sequence[int]) -> tuple[int, ...]:
 
     Args:
         text: numbers and ranges with commas between; both ends of a range belong to it, and of a range with a step
-            every so-manieth number from its first counts. Numbers of a range that the take lacks are passed over.
+            only what lies whole steps from its first. Numbers of a range that the take lacks are passed over.
         frame_ids: of the take.
     Raises:
         InputError: the text is none of this, or names a frame, or a range of frames, that the take does not have.

@@ -177,6 +177,7 @@ def test_a_day(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: 
     # tracked on from there; the seventh frame has another neighbour
     assert watch.done() == Done(extracted=1, tracked=2, refined=3, registered=3, drawn=6)
 
+    shutil.copytree(work, tmp_path / "before")
     changed = [*command, "--registration.sequence.relax", "0.5"]
     said = fails(capsys, *changed)
     assert "registration: was made with other settings (relax 0.4 to 0.5); with --overwrite the same command" in said
@@ -190,6 +191,13 @@ def test_a_day(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: 
     assert watch.done() == Done(registered=3)
     assert run(*changed) == 0
     assert watch.done() == Done(registered=6, drawn=6)
+
+    capsys.readouterr()
+    assert run("diff", tmp_path / "before", work) == 0
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if "relax" in line)
+    assert "0.4" in line
+    assert "0.5" in line
+    assert watch.done() == Done(), "a comparison writes its page alone"
 
     scratch = tmp_path / "scratch"
     pipeline.take_over(scratch, work)
