@@ -80,7 +80,7 @@ def test_the_captured_motion_gives_back_the_capture(garment_model: GarmentModel,
     found = garment_model.vertices(poses, remove_intersections=False)
     good = np.delete(np.arange(16), 4)
     apart = np.linalg.norm(found[good] - registered.vertices[good], axis=-1)
-    assert np.median(apart) < 0.004  # what stretches as no cloth does is drawn in
+    assert np.median(apart) < 0.008  # what stretches as no cloth does is drawn in
 
 
 @pytest.mark.parametrize(
