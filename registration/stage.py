@@ -261,7 +261,7 @@ def _garment_digest(garment: Garment) -> str:
     template = garment.template
     arrays = [template.vertices, template.faces, *garment.loops.values()]
     arrays += [each for each in (template.uv, garment.skin_weights) if each is not None]
-    return digest_of([_array_digest(*arrays), list(garment.loops)])
+    return digest_of([_array_digest(*arrays), list(garment.loops), garment.pattern_metres])
 
 
 def _array_digest(*arrays: np.ndarray) -> str:

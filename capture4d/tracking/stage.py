@@ -28,6 +28,7 @@ from capture4d.body.anny import load_anny
 from capture4d.captures.capture import Capture
 from capture4d.captures.scan_states import replaced_scan, require_same_take
 from capture4d.captures.take_colours import colours_of_take, kept_colours, take_colours
+from capture4d.errors import InputError
 from capture4d.files.arrays import ArrayFile
 from capture4d.files.atomic import read_json, read_json_lines, write_json_lines
 from capture4d.files.records import load_body, save_body, save_poses
@@ -64,6 +65,11 @@ def run(
     Raises:
         InputError: the capture is damaged, none of its scans can be read, or the start is no pose of its body.
     """
+    start = Path(config.start)
+    if start.is_file() and start.resolve().is_relative_to(output.resolve()):
+        raise InputError(
+            "start: expected a motion file outside of the folder that is written, found one in it", where=start
+        )
     if not overwrite:
         require_same_take(output, capture)
     stage = open_growing_stage(

@@ -138,6 +138,16 @@ def test_nothing_but_damaged_scans_is_an_error_again_and_again(tmp_path: Path) -
         tracking_digest(tmp_path / "work" / "body", read_capture(tmp_path / "capture"))
 
 
+def test_a_start_that_overwriting_would_delete_is_refused(tmp_path: Path) -> None:
+    dressed_capture(tmp_path / "capture", 1)
+    body = tmp_path / "work" / "body"
+    body.mkdir(parents=True)
+    (body / "poses.npz").write_bytes(b"an earlier run's")
+    with pytest.raises(InputError, match=r"poses\.npz: start: expected a motion file outside of the folder"):
+        run(read_capture(tmp_path / "capture"), body, TrackingConfig(start=str(body / "poses.npz")), overwrite=True)
+    assert (body / "poses.npz").read_bytes() == b"an earlier run's"
+
+
 def test_a_start_that_is_no_file_and_a_stage_that_was_not_run(tmp_path: Path) -> None:
     dressed_capture(tmp_path / "capture", 1)
     with pytest.raises(InputError, match="expected search, rest or a motion file, found 'nowhere'"):
