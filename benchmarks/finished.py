@@ -82,7 +82,7 @@ def run(*, quick: bool = False, frames: int = 10_000) -> list[Metric]:
 
 def _command(capture: Path | None, work: Path | None) -> tuple[float, float]:
     """Seconds of wall and of CPU of a run, or of a command that does nothing but load what a run loads."""
-    arguments = ["-m", "capture4d", "run", str(capture), "--output", str(work), "--track", "--workers", "1"]
+    arguments = ["-m", "capture4d", "run", str(capture), "--output", str(work), "--tracked", "--workers", "1"]
     if capture is None:
         arguments = ["-c", "import capture4d.extraction.stage, capture4d.tracking.stage, registration.stage"]
     begin, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)

@@ -17,7 +17,7 @@ from capture4d.tracking.config import TrackingConfig
 from registration.config import RegistrationConfig
 
 if TYPE_CHECKING:
-    from capture4d.captures.capture import Capture
+    from capture4d.captures.work_folder import AnyCapture
 
 __all__ = ["Extract", "Register", "Report", "Run", "Track"]
 
@@ -168,11 +168,12 @@ class Run(DryRunOptions, DecidingOptions, GradedOptions, MeshOptions):
         return self.graded(result)
 
 
-def _say_lengths(capture: Capture) -> None:
+def _say_lengths(capture: AnyCapture) -> None:
     """Tell where the lengths of the cloth come from, before a night is spent on it."""
+    from capture4d.captures.work_folder import opened_capture
     from capture4d.preflight.readiness import pattern_told
 
-    print(pattern_told(capture))
+    print(pattern_told(opened_capture(capture)))
 
 
 def _say_clouds(work: Path) -> None:
