@@ -189,10 +189,15 @@ def load_kernel(path: Path, *, model_digest: str) -> KernelRegressor:
     """Raises InputError: the file is damaged, another kind, or belongs to another model."""
     file, layout, scales = read_regressor(path, _KIND, model_digest=model_digest)
     shares, frames, answers, middle = (file[name] for name in ("shares", "frames", "answers", "middle"))
+    if (shares.ndim, frames.ndim, answers.ndim, middle.ndim) != (1, 2, 2, 1):
+        shapes = ", ".join(str(each.shape) for each in (shares, frames, answers, middle))
+        raise InputError(
+            f"expected shares, frames, answers, middle of 1, 2, 2, 1 dimensions, found them of {shapes}", where=path
+        )
     views = tuple(file[f"views.{number}"] for number in range(len(shares)))
     wanted = (len(frames), layout.size), (len(frames), len(middle))
     found = frames.shape, answers.shape
-    if wanted != found or any(len(view) != layout.size for view in views):
+    if wanted != found or any(view.ndim != 2 or len(view) != layout.size for view in views):
         raise InputError(
             f"expected learned frames of {wanted[0]} and {wanted[1]}, found {found[0]}, {found[1]}", where=path
         )

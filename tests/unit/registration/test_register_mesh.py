@@ -98,7 +98,7 @@ def test_paint_may_be_in_a_texture(garment, scan_of, quick, tmp_path: Path) -> N
     assert result.notes == ()
     # A face of another material, which no file has.
     (tmp_path / "scan.obj").write_text("mtllib scan.mtl\nusemtl a\n" + text + "usemtl b\nf 1/1 2/2 3/3\n")
-    noted = run(*files, painted, find_border=painted_border).notes
+    noted = run(*files, painted, find_border=painted_border, overwrite=True).notes
     assert noted == (f"{tmp_path / 'scan.obj'}: no material 'b' in scan.mtl",)
 
 
@@ -198,7 +198,7 @@ def test_a_scan_may_be_points_alone(kind: str, garment, scan_of, quick, tmp_path
     write_mesh(tmp_path / f"cloud.{kind}", Mesh(scan.vertices, scan.faces[:0]))
     truth, off = swell(garment.template.vertices.astype(float)), {}
     for name in ("mesh.ply", f"cloud.{kind}"):
-        result = run(tmp_path / "template.obj", tmp_path / name, tmp_path / "out.ply", quick)
+        result = run(tmp_path / "template.obj", tmp_path / name, tmp_path / "out.ply", quick, overwrite=True)
         off[result.estimated] = np.linalg.norm(result.vertices - truth, axis=1).mean()
         told = json.loads((tmp_path / "out.json").read_text())["scan_faces"]
         assert told == ("estimated" if result.estimated else "given")
