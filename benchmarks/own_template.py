@@ -145,14 +145,14 @@ def _error_mm(capture: Capture, garments: Path, garment: Garment, truth: np.ndar
     row = {frame_id: index for index, frame_id in enumerate(capture.frame_ids)}
     errors = [
         correspondence_errors(result.vertices, truth[row[result.frame_id]]).mean()
-        for positions in segments(mover, len(capture.frame_ids), config.sequence)
+        for positions in segments(None, len(capture.frame_ids), config.sequence)
         for result in register_run(
             analysis,
             mover,
             positions,
             capture.frame_ids,
             load=lambda frame_id: load_garment_scan(garments / "frames" / f"{frame_id:06d}.npz", frame_id),
-            done=lambda _: None,
+            done=lambda _, __: None,
             config=config,
         )
     ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from capture4d.files.border_loops import on_open_edges
 from capture4d.files.json_values import number, text, texts
@@ -38,10 +39,11 @@ def load_blendshapes(path: str | Path) -> BlendshapeModel:
     file = read_tensors(path, _KIND)
     with reading(path, "blendshape model"):
         template = Mesh(file["template_vertices"], file["template_faces"], file.get("template_uv"))
+        optional: dict[str, Any] = {name: file.get(name) for name in _OPTIONAL}
         garment = Garment(
             template,
             loops={name: file[f"loop_{name}"] for name in texts(file.entry("loops"), "loops")},
-            **{name: file.get(name) for name in _OPTIONAL},
+            **optional,
         )
         return BlendshapeModel(
             on_open_edges(garment),

@@ -25,7 +25,6 @@ import numpy as np
 from capture4d.captures.capture import Capture
 from capture4d.captures.description import parse_description
 from capture4d.captures.placement import Placement, place, place_rig
-from capture4d.captures.scan_files import list_scans
 from capture4d.captures.take_colours import template_loops
 from capture4d.colours.spaces import format_colour, parse_colour
 from capture4d.errors import InputError
@@ -44,6 +43,8 @@ __all__ = ["Fixed", "fixed_path", "require_place", "write_fixed"]
 
 UNUSABLE = ("frame-partial", "frame-repeated", "scale-jump", "poses-missing")
 """Findings whose frames are left out; frames that cannot be read are left out anyway."""
+COMPANIONS = (".mtl", ".bin", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".tga")
+"""What may lie beside scans or in folders below, and belongs to them: materials, buffers, textures."""
 RECORD = "fix.json"
 """What the unfinished folder is being made of."""
 How = Literal["rewritten", "linked", "copied", "unreadable"]
@@ -249,7 +250,9 @@ def _linked(source: Path, target: Path) -> How:
 def _link_companions(take: TakeFolder, folder: Path) -> None:
     """Materials, buffers and textures, where the scans look for them."""
     origin = take.path / "scans" if (take.path / "scans").is_dir() else take.path
-    for path in list_scans(origin, take.claims.frames).companions:
+    for path in sorted(origin.rglob("*")):
+        if path.suffix.lower() not in COMPANIONS or not path.is_file():
+            continue
         target = folder / path.relative_to(origin)
         target.parent.mkdir(parents=True, exist_ok=True)
         _linked(path, target)
