@@ -72,10 +72,9 @@ def find_placement(mesh: Mesh, body: PosedBody, *, units: MeshUnits = "auto", up
     turns = [turn for turn in _quarter_turns() if up is None or _points_up(turn, up)]
     usual: Units = "m" if units == "auto" else units
     possible: list[Units] = [usual]
-    unit: Units
-    for unit in METRES:
-        if units == "auto" and unit != usual and SIZES_M[0] <= size * METRES[unit] <= SIZES_M[1]:
-            possible.append(unit)
+    if units == "auto":
+        every: tuple[Units, ...] = tuple(METRES)
+        possible += [unit for unit in every if unit != usual and SIZES_M[0] <= size * METRES[unit] <= SIZES_M[1]]
     tree = KDTree(body.vertices())
     ways: list[tuple[float, Placed]] = []
     for unit, turn in itertools.product(possible, turns):
