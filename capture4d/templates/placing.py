@@ -74,7 +74,7 @@ def find_placement(mesh: Mesh, body: PosedBody, *, units: MeshUnits = "auto", up
     possible: list[Units] = [usual]
     if units == "auto":
         every: tuple[Units, ...] = tuple(METRES)
-        possible += [unit for unit in every if unit != usual and SIZES_M[0] <= size * METRES[unit] <= SIZES_M[1]]
+        possible.extend(unit for unit in every if unit != usual and SIZES_M[0] <= size * METRES[unit] <= SIZES_M[1])
     tree = KDTree(body.vertices())
     ways: list[tuple[float, Placed]] = []
     for unit, turn in itertools.product(possible, turns):

@@ -205,6 +205,6 @@ def test_a_scan_may_be_points_alone(kind: str, garment, scan_of, quick, tmp_path
     assert off[True] < 1.15 * off[False]
     write_mesh(tmp_path / "few.ply", Mesh(scan.vertices[:40], scan.faces[:0]))
     with pytest.raises(InputError, match=r"few\.ply: expected a mesh, or a cloud of at least 100 points"):
-        run(tmp_path / "template.obj", tmp_path / "few.ply", tmp_path / "out.ply", quick)
+        run(tmp_path / "template.obj", tmp_path / "few.ply", tmp_path / "none.ply", quick)
     with pytest.raises(InputError, match=r"cloud\.\w+: empty mesh, found \d+ vertices and no faces"):
-        run(tmp_path / f"cloud.{kind}", tmp_path / "mesh.ply", tmp_path / "out.ply", quick)
+        run(tmp_path / f"cloud.{kind}", tmp_path / "mesh.ply", tmp_path / "none.ply", quick)
