@@ -95,7 +95,7 @@ class WrinkleModel:
         network = self._in_half_precision() if half_precision else self.generator
         seen = (image.to(torch.bfloat16) if half_precision else image).contiguous(memory_format=torch.channels_last)
         made = answer(network, seen, image, crop=self.crop)
-        return ((_unit(made) - image) * shown)[0]
+        return ((_unit(made) - _unit(image)) * shown)[0]
 
     def _in_half_precision(self) -> UNet:
         """A copy of the generator, made once: the weights must not change any more."""

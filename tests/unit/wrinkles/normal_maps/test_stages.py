@@ -300,7 +300,9 @@ def test_a_network_without_anything_to_say_leaves_maps_flat_at_every_size(traine
     for texels in (64, 300):
         off = np.abs(wrinkle_map(kept, vertices, texels=texels) - [0, 0, 1]).max(axis=-1)
         raster = MapTemplate.laid_out(kept.template, kept.maps.sized(texels)).raster
-        assert off[raster.image(raster.inside)].max() < 5e-3
+        shown = off[raster.image(raster.inside)]
+        assert np.quantile(shown, 0.8) < 1e-6
+        assert shown.max() < 0.05  # beside seams, where both sides are made alike
         assert off.max() < 0.1  # beyond the corners of an island, where seams end
 
 
