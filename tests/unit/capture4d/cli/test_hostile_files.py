@@ -174,7 +174,7 @@ def test_a_hostile_file_is_one_line(name: str, tmp_path: Path, capsys: pytest.Ca
         before = everything(tmp_path)
         said = one_line(capsys, "convert-poses", path, tmp_path / "out.npz", "--body", tmp_path / "body.npz")
     elif name in SCANS:
-        output = ("--output", tmp_path / "work", "--workers", "1")
+        output = ("--output", tmp_path / "work", "--workers", "1", "--quiet")
         said = one_line(capsys, "extract", path.parents[1], *output)
     else:
         said = one_line(capsys, "register-mesh", path, path, "--output", tmp_path / "out.ply")
@@ -203,6 +203,6 @@ def test_a_pipe_under_the_name_of_a_scan_is_one_line(
     scan = next(iter(sorted((tube_capture / "scans").iterdir())))
     scan.unlink()
     os.mkfifo(scan)
-    said = one_line(capsys, "extract", tube_capture, "--output", tmp_path / "work", "--workers", "1")
+    said = one_line(capsys, "extract", tube_capture, "--output", tmp_path / "work", "--workers", "1", "--quiet")
     assert said == f"capture4d: {scan}: no such scan; 1 of 3 frames in capture.json have none\n"
     assert not (tmp_path / "work").exists()

@@ -91,6 +91,7 @@ def test_a_near_miss_gets_a_hint(capsys: pytest.CaptureFixture[str]):
 
 
 def test_a_preset_is_what_single_options_start_from(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    from capture4d.cli.commands import stages
     from registration.config import PAPER, GraphConfig, RegistrationConfig
 
     seen = []
@@ -100,6 +101,7 @@ def test_a_preset_is_what_single_options_start_from(monkeypatch: pytest.MonkeyPa
         return StageResult(work, "")
 
     monkeypatch.setattr(pipeline, "register", register)
+    monkeypatch.setattr(stages, "_say_lengths", lambda capture: None)
     for options in ([], ["--preset", "paper"], ["--preset=paper", "--registration.graph.nodes", "99"]):
         run("register", "capture", "--output", tmp_path, *options)
     assert seen[0] == RegistrationConfig()

@@ -204,9 +204,9 @@ def test_resampling_is_told_and_nothing_else_is(tmp_path: Path, capsys: pytest.C
     save_poses(source, random_poses(load_anny(), 6, frames=7))
     line = f"capture4d: {source}: 60 frames a second, resampled to 20: 7 frames became 3\n"
     for fps, said in ((20.0, line), (60.0, ""), (60.0 * (1 + 1e-5), "")):
-        assert run("convert-poses", source, out, "--fps", fps) == 0
+        assert run("convert-poses", source, out, "--fps", fps, "--overwrite") == 0
         assert capsys.readouterr().err == said
-    assert run("convert-poses", source, out) == 0
+    assert run("convert-poses", source, out, "--overwrite") == 0
     assert capsys.readouterr().err == ""
     notes: list[str] = []
     assert len(read_motion(source, load_anny(), fps=30.0, say=notes.append).frame_ids) == 4

@@ -88,8 +88,8 @@ def test_other_settings_than_before_are_refused_before_the_first_stage(
 
     monkeypatch.setattr("capture4d.pipeline.extract", extract)
     said = fails(capsys, *command, "--registration.graph.nodes", "30")
-    assert "graph.nodes: was 20, now 30" in said
-    assert said.endswith("use --overwrite")
+    assert "nodes 20 to 30" in said
+    assert "with --overwrite the same command makes it anew" in said
 
 
 def test_where_lengths_come_from_is_said(tube_capture: Path) -> None:
