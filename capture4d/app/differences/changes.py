@@ -143,14 +143,12 @@ class MetricChange:
 
     @property
     def meaning(self) -> str:
-        """A whole one: what "the same" is in a table, by the row above, is said."""
+        """A whole one: what "the same" is in a table, by the last row above that says it, is said."""
         told = _known(self.key)[2]
         table = METRICS if self.key in METRICS else ANIMATION_METRICS
-        for key in reversed(list(table)[: list(table).index(self.key)]):
-            if not told.startswith("the same"):
-                break
-            told = told.replace("the same", table[key][2], 1)
-        return told
+        above = [each[2] for each in list(table.values())[: list(table).index(self.key)]]
+        whole = next((each for each in reversed(above) if not each.startswith("the same")), "")
+        return told.replace("the same", whole, 1) if told.startswith("the same") else told
 
     @property
     def delta(self) -> float | None:

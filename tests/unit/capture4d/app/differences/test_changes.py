@@ -56,6 +56,10 @@ def test_a_meaning_stands_alone():
         meanings["fit_p95_mm"]
         == "template vertices to the scan's surface, where it has data, 95th percentile of a frame"
     )
+    assert (
+        meanings["fit_max_mm"]
+        == "template vertices to the scan's surface, where it has data, the farthest vertex of the take"
+    )
 
 
 @pytest.fixture
