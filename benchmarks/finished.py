@@ -66,7 +66,9 @@ def run(*, quick: bool = False, frames: int = 10_000) -> list[Metric]:
         before = {path: path.stat().st_mtime_ns for path in work.rglob("*.npz")}
         wall_s, cpu_s = _command(capture, work)
         assert {path: path.stat().st_mtime_ns for path in work.rglob("*.npz")} == before, "nothing was to be done"
-        os.utime(next(iter(read_capture(capture).files.scans.values())))  # type: ignore[union-attr]
+        files = read_capture(capture).files
+        assert files is not None, "the capture was read from a folder"
+        os.utime(next(iter(files.scans.values())))
         copied_s, _ = _command(capture, work)
         nothing_s = _command(None, None)[1]
         reference_s = _reference(work)

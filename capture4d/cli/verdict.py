@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from capture4d.captures.frame_ranges import frame_ranges
+from capture4d.runs.frame_lists import frame_ranges
 
 __all__ = ["MOST_RANGES", "flagged_line", "say_flagged", "say_verdict", "say_work", "verdict_line"]
 

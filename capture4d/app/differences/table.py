@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from capture4d.app.differences.changes import MetricChange
 from capture4d.app.differences.work_diff import WorkDiff
 from capture4d.app.report.metrics import shown
-from capture4d.captures.frame_ranges import frame_ranges
+from capture4d.runs.frame_lists import frame_ranges
 
 __all__ = ["aligned", "frames_told", "table_lines"]
 

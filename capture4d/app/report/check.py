@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from capture4d.app.drawing.page import Badge, Column, Table, render_page
-from capture4d.captures.frame_ranges import frame_ranges
 from capture4d.files.atomic import write_bytes
 from capture4d.preflight.check import Checked
 from capture4d.preflight.findings import Verdict
+from capture4d.runs.frame_lists import frame_ranges
 
 __all__ = ["as_json", "print_table", "status", "write_page"]
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from capture4d.app.drawing.page import Badge, Column, Table
 from capture4d.app.report.metrics import shown
-from capture4d.captures.frame_ranges import frame_ranges
+from capture4d.runs.frame_lists import frame_ranges
 
 __all__ = ["FLAGGED_NOTE", "flagged_table", "verdict_counts", "verdict_runs"]
 

@@ -7,7 +7,7 @@ from datetime import datetime
 from capture4d.app.differences.table import aligned
 from capture4d.app.status.plan import Plan, StagePlan
 from capture4d.app.status.survey import StageStatus, WorkStatus
-from capture4d.captures.frame_ranges import frame_ranges
+from capture4d.runs.frame_lists import frame_ranges
 from capture4d.runs.locks import Holder
 
 __all__ = ["duration", "plan_lines", "size", "status_lines"]
