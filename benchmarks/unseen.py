@@ -80,10 +80,11 @@ def run(
 
     Args:
         quick: a tiny model, few frames; the same keys.
-        mocap: a folder of BVH files, to move to as well; the cloth is simulated on those named *walk* and *hop*.
+        mocap: a folder of BVH files, to move to as well.
         frames: of each motion and simulated clip.
         training: also the model of `tshirt-train`, for whose takes an hour is needed the first time.
         scans: learn that from scans, which takes two hours more.
+        simulate: the cloth on those of the BVH files that are named *walk* or *hop*, too.
     """
     if mocap is not None and not mocap.is_dir():
         raise InputError("expected a folder of BVH files, found none", where=mocap)
@@ -101,7 +102,7 @@ def run(
                 motions[path.stem] = _first(read_motion(path, garment.body, fps=garment.model.fps), count)
             for name, poses in motions.items():
                 measured.append(_measure(model, garment, name, poses, who, None))
-        for name, motion in _truths(model, recorded, quick).items():
+        for name, motion in _truths(model, recorded if simulate else [], quick).items():
             take = replace(model.like, name=f"{model.like.name}-{name}", motion=motion, frames=count, scans=False)
             measured.append(_measure_take(model, garment, f"{name} (simulated)", cached_take(take, workers=workers)))
         taught += [_measure_take(model, garment, f"{path.name} (its own)", path) for path in model.own]
