@@ -74,7 +74,14 @@ class Model:
 
 
 def run(
-    *, quick: bool = False, workers: int = 2, mocap: Path | None = None, frames: int = 60, training: bool = True
+    *,
+    quick: bool = False,
+    workers: int = 2,
+    mocap: Path | None = None,
+    frames: int = 60,
+    training: bool = True,
+    scans: bool = False,
+    simulate: bool = False,
 ) -> list[Metric]:
     """Animate every model on every motion.
 
