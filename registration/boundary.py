@@ -20,9 +20,13 @@ from typing import Literal, assert_never
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int32
-from scipy.spatial import KDTree
+
+from capture4d.geometry.point_grid import PointGrid
 
 __all__ = ["BorderTargets", "border_targets", "tangent_free_metric"]
+
+CURVE_POINTS = 6.0
+"""A search cell is as long as so many points of a curve, if they lay on a line: some three times that on a loop."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,9 +79,10 @@ def _groups(loops: np.ndarray, scan_loops: np.ndarray) -> Sequence[tuple[np.ndar
 
     Points whose paint does not tell vote among the loops that no point names.
     """
-    told = np.unique(scan_loops[scan_loops >= 0])
+    points_of = np.bincount(scan_loops[scan_loops >= 0], minlength=int(loops.max()) + 1)
+    told = np.flatnonzero(points_of)
     parts = [(np.flatnonzero(loops == loop), np.flatnonzero(scan_loops == loop)) for loop in told]
-    parts.append((np.flatnonzero(~np.isin(loops, told)), np.flatnonzero(scan_loops < 0)))
+    parts.append((np.flatnonzero(points_of[loops] == 0), np.flatnonzero(scan_loops < 0)))
     return [(template, scan) for template, scan in parts if len(template) and len(scan)]
 
 
@@ -85,10 +90,10 @@ def _one_group(
     border: np.ndarray, scan_points: np.ndarray, rule: Literal["argmax", "nearest", "mean"], gate: float
 ) -> tuple[np.ndarray, np.ndarray]:
     if rule == "nearest":
-        distance, index = KDTree(scan_points).query(border, distance_upper_bound=gate)
+        distance, index = _nearest(scan_points, border, gate)
         found = np.isfinite(distance)
         return scan_points[np.where(found, index, 0)], found
-    all_distances, nearest = map(np.asarray, KDTree(border).query(scan_points, distance_upper_bound=gate))
+    all_distances, nearest = _nearest(border, scan_points, gate)
     voter = np.flatnonzero(np.isfinite(all_distances))
     voted, distance = nearest[voter], all_distances[voter]
     targets, found = border.copy(), np.zeros(len(border), bool)
@@ -105,3 +110,10 @@ def _one_group(
     else:
         assert_never(rule)
     return targets, found
+
+
+def _nearest(points: np.ndarray, queries: np.ndarray, gate: float) -> tuple[np.ndarray, np.ndarray]:
+    """Distance to the nearest of some points along curves, infinite beyond the gate, and its index."""
+    extent = float((points.max(axis=0) - points.min(axis=0)).max())
+    cell = np.clip(CURVE_POINTS * extent / len(points), gate / 8, gate)
+    return PointGrid.build(points, float(cell)).query(queries, gate)

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float64, Int32
 
 from capture4d.heavy_imports import njit
-from registration.solver import BlockTerm
+from registration.solver import BlockTerm, EdgeTerm
 
-__all__ = ["plane_metric", "rigid_term", "stretch_metric", "tangential_metric"]
+__all__ = ["edge_vectors", "plane_metric", "rigid_term", "stretch_metric", "stretch_term", "tangential_metric"]
 
 
 def plane_metric(
@@ -60,6 +60,35 @@ def stretch_metric(
         compression: share of the weight for edges that are shorter than at rest.
     """
     return stretch_kernel(ends, rest_lengths, weight / max(len(ends), 1), compression)
+
+
+def stretch_term(
+    vertices: Float64[np.ndarray, "verts 3"],
+    edges: Int32[np.ndarray, "edges 2"],
+    rest_lengths: Float64[np.ndarray, " edges"],
+    *,
+    weight: float,
+    compression: float,
+) -> EdgeTerm:
+    """`stretch_metric` of free vertices, without matrices: edge lengths against the template's."""
+    return EdgeTerm(edges, *edges_kernel(vertices, edges, rest_lengths, weight / max(len(edges), 1), compression))
+
+
+@njit(cache=True)
+def edges_kernel(vertices, edges, rest, weight, compression):
+    count = len(edges)
+    directions, residual = np.zeros((count, 3)), np.zeros(count)
+    for e in range(count):
+        a, b = edges[e, 0], edges[e, 1]
+        x, y, z = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
+        length = np.sqrt(x * x + y * y + z * z)
+        if length == 0.0:
+            continue
+        excess = length - rest[e]
+        root = np.sqrt(weight if excess > 0.0 else weight * compression)
+        residual[e] = root * excess
+        directions[e, 0], directions[e, 1], directions[e, 2] = root * x / length, root * y / length, root * z / length
+    return directions, residual
 
 
 @njit(cache=True)

@@ -66,7 +66,7 @@ def folded_lengths(
     points, normals = surface.points[::stride], surface.normals[::stride]
     centres = vertices[faces].mean(axis=1)
     reach = REACH * float(rest_lengths.mean())
-    _, face = PointGrid.build(centres, 0.5 * reach).query(points, reach)
+    _, face = PointGrid.build(centres, reach).query(points, reach)
     moments, counts = slope_moments(vertices, faces, face, normals, MIN_COSINE)
     return shortened(vertices, edges, faces_of_edges, rest_lengths, moments, counts, MIN_POINTS)
 

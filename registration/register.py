@@ -25,9 +25,16 @@ from registration.correspondences import (
     prepare_scan,
 )
 from registration.deformation_graph import identity_nodes, node_edge_rows, rows_of_vertices, smooth_rows
-from registration.energies import edge_vectors, plane_metric, rigid_term, stretch_metric, tangential_metric
+from registration.energies import (
+    edge_vectors,
+    plane_metric,
+    rigid_term,
+    stretch_metric,
+    stretch_term,
+    tangential_metric,
+)
 from registration.fold_lengths import folded_lengths
-from registration.solver import Rows, RowTerm, gauss_newton_step
+from registration.solver import Rows, RowTerm, SmoothTerm, Term, gauss_newton_step
 from registration.template import TemplateAnalysis, require_borders
 
 __all__ = ["FrameRegistration", "FrameScan", "prepare_frame", "register_frame"]
@@ -185,11 +192,7 @@ def _dense_stage(
     count = len(vertices)
     every = np.arange(count)
     iterations = 0
-    border_rows = Rows(
-        np.arange(len(analysis.border.vertices) + 1, dtype=np.int32),
-        analysis.border.vertices,
-        np.ones((len(analysis.border.vertices), 1)),
-    )
+    border_rows = Rows.of_points(analysis.border.vertices)
     reference = analysis.laplacian_rows.apply(vertices[:, :, None])
     lengths = analysis.rest_lengths
     if schedule.steps and near and config.dense.fold_lengths:
@@ -199,19 +202,24 @@ def _dense_stage(
     for step in range(schedule.steps):
         at = (step, schedule.steps)
         gate = anneal(schedule.gate, *at)
-        terms = [_data_term(analysis, analysis.vertex_rows, scan.surface, vertices, every, gate, config)]
+        terms: list[Term] = [_data_term(analysis, analysis.vertex_rows, scan.surface, vertices, every, gate, config)]
         terms += _border_terms(
             analysis, border_rows, scan, vertices, anneal(schedule.boundary, *at), config.boundary.gate,
             rule=config.boundary.dense_rule, along_curve=config.boundary.along_curve,
         )  # fmt: skip
-        stretch, excess = stretch_metric(
-            edge_vectors(vertices, analysis.edges), lengths,
-            weight=anneal(schedule.stretch, *at), compression=config.dense.compression,
+        terms.append(
+            stretch_term(
+                vertices, analysis.edges, lengths,
+                weight=anneal(schedule.stretch, *at), compression=config.dense.compression,
+            )
         )  # fmt: skip
-        terms.append(RowTerm(analysis.edge_rows, stretch, excess))
         bending = analysis.laplacian_rows.apply(vertices[:, :, None]) - reference
-        smooth = np.ascontiguousarray(np.broadcast_to(anneal(schedule.smooth, *at) / count * np.eye(3), (count, 3, 3)))
-        terms.append(RowTerm(analysis.laplacian_rows, smooth, (1.0 - config.dense.plasticity) * bending))
+        terms.append(
+            SmoothTerm(
+                analysis.laplacian_rows, analysis.laplacian_columns,
+                anneal(schedule.smooth, *at) / count, (1.0 - config.dense.plasticity) * bending,
+            )
+        )  # fmt: skip
         anchor = anneal(schedule.anchor, *at)
         if anchor > 0.0:
             weights, normals = np.full(count, anchor / count), mesh_normals(vertices, analysis.faces)

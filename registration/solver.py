@@ -6,8 +6,10 @@ Unknowns are N blocks X_n of shape (3, B): B = 1 for a free point, B = 4 for an 
     r_k(X) = sum_n X_n c_kn + const,        c_kn of length B,
 
 measured by a symmetric 3x3 metric M_k: a point-to-plane distance has M = w n n^T, a point-to-point one M = w I. Terms
-that touch one block only and are not of this form come as a ready Hessian and gradient per block. `Rows` holds the
-sparsity and is analysed once per template; a step never assembles J^T M J but its diagonal blocks, which precondition.
+that touch one block only and are not of this form come as a ready Hessian and gradient per block. Of points there are
+two kinds of terms that need no metric, and so a third of the time: lengths of edges, and differences whose metric is
+the same number for all. `Rows` holds the sparsity and is analysed once per template; a step never assembles J^T M J
+but its diagonal blocks, which precondition.
 
 All loops run in a fixed order on one thread: results do not depend on the number of workers.
 """
@@ -18,11 +20,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64, Int32
+from jaxtyping import Float64, Int32, Integer
 
 from capture4d.heavy_imports import njit
 
-__all__ = ["BlockTerm", "RowTerm", "Rows", "add_block_diagonal", "gauss_newton_step", "rows_product", "rows_transpose"]
+__all__ = [
+    "BlockTerm",
+    "EdgeTerm",
+    "RowTerm",
+    "Rows",
+    "SmoothTerm",
+    "add_block_diagonal",
+    "gauss_newton_step",
+    "rows_product",
+    "rows_transpose",
+]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,6 +46,23 @@ class Rows:
     """Block of each entry."""
     coefficients: Float64[np.ndarray, "entries width"]
     """c_kn of each entry."""
+    is_identity: bool = False
+    """Every row is a block of width 1 by itself, and no block has two."""
+
+    @staticmethod
+    def of_points(points: Integer[np.ndarray, " rows"]) -> Rows:
+        """Some points as they are, none of them twice."""
+        count = len(points)
+        return Rows(
+            np.arange(count + 1, dtype=np.int32), points.astype(np.int32), np.ones((count, 1)), is_identity=True
+        )
+
+    def transposed(self, blocks: int) -> Rows:
+        """The map from 3-vectors to so many blocks of width 1."""
+        row = np.repeat(np.arange(len(self)), np.diff(self.offsets))
+        order = np.argsort(self.columns, kind="stable")
+        offsets = np.concatenate([[0], np.cumsum(np.bincount(self.columns, minlength=blocks))])
+        return Rows(offsets.astype(np.int32), row[order].astype(np.int32), self.coefficients[order])
 
     def __len__(self) -> int:
         return len(self.offsets) - 1
@@ -53,6 +82,32 @@ class RowTerm:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class EdgeTerm:
+    """sum_e (a_e . (x_end - x_start) + r_e)^2 of points, at the current state."""
+
+    edges: Int32[np.ndarray, "edges 2"]
+    """Start and end."""
+    directions: Float64[np.ndarray, "edges 3"]
+    """a_e, with the root of the weight in it."""
+    residual: Float64[np.ndarray, " edges"]
+    """r_e, with the same."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SmoothTerm:
+    """w sum_k |r_k|^2 of points, at the current state."""
+
+    rows: Rows
+    columns: Rows
+    """The same map, transposed."""
+    weight: float
+    residual: Float64[np.ndarray, "rows 3"]
+
+
+Term = RowTerm | EdgeTerm | SmoothTerm
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class BlockTerm:
     """A quadratic model per block: x^T H x / 2 + g^T x, with H and g of the flattened block."""
 
@@ -61,7 +116,7 @@ class BlockTerm:
 
 
 def gauss_newton_step(
-    terms: Sequence[RowTerm],
+    terms: Sequence[Term],
     block_term: BlockTerm | None,
     block_count: int,
     *,
@@ -72,63 +127,175 @@ def gauss_newton_step(
     """Solve (sum J^T M J + H + damping D) X = -(sum J^T M r + g), D the diagonal, by block-Jacobi conjugate gradients.
 
     Args:
+        terms: of one width; at most one of them smooths.
         damping: relative to the diagonal; keeps blocks that no residual touches in place.
     Returns:
         The step and the number of iterations.
     """
-    width = terms[0].rows.coefficients.shape[1]
+    kinds = tuple([term for term in terms if isinstance(term, kind)] for kind in (RowTerm, EdgeTerm, SmoothTerm))
+    row_terms, edge_terms, smooth_terms = kinds
+    rows = _stacked([term for term in row_terms if not term.rows.is_identity])
+    width = 1 if edge_terms or smooth_terms or not len(rows.coefficients) else rows.coefficients.shape[1]
     size = 3 * width
-    diagonal = np.zeros((block_count, size, size))
-    gradient = np.zeros((block_count, 3, width))
-    for term in terms:
-        add_block_diagonal(term.rows.offsets, term.rows.columns, term.rows.coefficients, term.metric, diagonal)
-        rows_transpose(
-            term.rows.offsets, term.rows.columns, term.rows.coefficients, term.metric, term.residual, gradient
-        )
-    hessian = np.zeros((0, size, size))
+    hessian, gradient = np.zeros((block_count, size, size)), np.zeros((block_count, 3, width))
+    for term in row_terms:
+        if term.rows.is_identity:
+            hessian[term.rows.columns] += term.metric
+            gradient[term.rows.columns, :, 0] += np.einsum("rab,rb->ra", term.metric, term.residual)
     if block_term is not None:
-        hessian = block_term.hessian
-        diagonal += hessian
+        hessian += block_term.hessian
         gradient += block_term.gradient.reshape(gradient.shape)
+    diagonal = hessian.copy()
+    add_block_diagonal(rows.offsets, rows.columns, rows.coefficients, rows.metric, diagonal)
+    rows_transpose(rows.offsets, rows.columns, rows.coefficients, rows.metric, rows.residual, gradient)
+    edges, directions = _NO_EDGES, _NO_DIRECTIONS
+    if edge_terms:
+        edges = np.concatenate([term.edges for term in edge_terms])
+        directions = np.concatenate([term.directions for term in edge_terms])
+        edges_add(edges, directions, np.concatenate([term.residual for term in edge_terms]), diagonal, gradient)
+    there = back = Rows.of_points(np.zeros(0, np.int32))
+    weight = 0.0
+    for term in smooth_terms:
+        there, back, weight = term.rows, term.columns, term.weight
+        gradient[:, :, 0] += weight * back.apply(term.residual[:, :, None])
+        own = np.add.reduceat(back.coefficients[:, 0] ** 2, back.offsets[:-1]) * (np.diff(back.offsets) > 0)
+        diagonal += (weight * own)[:, None, None] * np.eye(3)
     axis = np.arange(size)
     floor = max(float(diagonal[:, axis, axis].max(initial=0.0)) * 1e-12, 1e-300)
     extra = damping * diagonal[:, axis, axis] + floor
     diagonal[:, axis, axis] += extra
+    hessian[:, axis, axis] += extra
     inverse = invert_points(diagonal) if size == 3 else np.linalg.inv(diagonal)
+    return conjugate_gradients(
+        (rows.offsets, rows.columns.view(np.uint32), rows.coefficients, upper_triangles(rows.metric)),
+        (edges.view(np.uint32), directions),
+        (there.offsets, there.columns.view(np.uint32), there.coefficients[:, 0].copy()),
+        (back.offsets, back.columns.view(np.uint32), back.coefficients[:, 0].copy()),
+        weight, hessian, inverse, gradient, tolerance, max_iterations,
+    )  # fmt: skip
 
-    def product(direction: np.ndarray) -> np.ndarray:
-        result = extra.reshape(direction.shape) * direction
-        if len(hessian):
-            block_products(hessian, direction, result)
-        for term in terms:
-            rows_normal_product(
-                term.rows.offsets, term.rows.columns, term.rows.coefficients, term.metric, direction, result
-            )
-        return result
 
+_NO_EDGES, _NO_DIRECTIONS = np.zeros((0, 2), np.int32), np.zeros((0, 3))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _StackedRows:
+    """The rows of several terms, those that measure something."""
+
+    offsets: Int32[np.ndarray, " rows_plus_1"]
+    columns: Int32[np.ndarray, " entries"]
+    coefficients: Float64[np.ndarray, "entries width"]
+    metric: Float64[np.ndarray, "rows 3 3"]
+    residual: Float64[np.ndarray, "rows 3"]
+
+
+def _stacked(terms: Sequence[RowTerm]) -> _StackedRows:
+    """The rows of some terms after each other, without those whose metric is 0."""
+    if not terms:
+        nothing = np.zeros((0, 3))
+        metric = np.zeros((0, 3, 3))
+        return _StackedRows(np.zeros(1, np.int32), np.zeros(0, np.int32), nothing[:, :1], metric, nothing)
+    rows = [term.rows for term in terms]
+    metric = np.concatenate([term.metric for term in terms])
+    residual = np.concatenate([term.residual for term in terms])
+    columns = np.concatenate([each.columns for each in rows])
+    coefficients = np.concatenate([each.coefficients for each in rows])
+    lengths = np.concatenate([np.diff(each.offsets) for each in rows])
+    kept = metric.reshape(-1, 9)[:, ::4].any(axis=1)
+    if not kept.all():
+        entries = np.repeat(kept, lengths)
+        columns, coefficients, lengths = columns[entries], coefficients[entries], lengths[kept]
+        metric, residual = metric[kept], residual[kept]
+    offsets = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
+    return _StackedRows(offsets, columns, coefficients, metric, residual)
+
+
+@njit(cache=True)
+def conjugate_gradients(rows, edges, there, back, weight, hessian, inverse, gradient, tolerance, max_iterations):
+    """(J^T M J + H) X = -g with block-Jacobi preconditioning; the step and the number of iterations."""
     step = np.zeros_like(gradient)
     residual = -gradient
-    start = dot(residual, residual)
-    if start == 0.0:
+    if dot(residual, residual) == 0.0:
         return step, 0
-    conditioned = np.zeros_like(residual)
+    conditioned, image = np.zeros_like(residual), np.zeros_like(residual)
+    smoothed = np.zeros((len(there[0]) - 1, 3))
     block_products(inverse, residual, conditioned)
     direction = conditioned.copy()
     energy = dot(residual, conditioned)
     target = energy * tolerance**2
+    along, pushed, moved = direction.ravel(), image.ravel(), step.ravel()
+    left, ready = residual.ravel(), conditioned.ravel()
     for iteration in range(1, max_iterations + 1):
-        image = product(direction)
+        block_products(hessian, direction, image)
+        if direction.shape[2] == 1:
+            normal_product_points(rows[0], rows[1], rows[2][:, 0], rows[3], direction[:, :, 0], image[:, :, 0])
+            edges_product(edges[0], edges[1], direction[:, :, 0], image[:, :, 0])
+            gathered(there, 1.0, direction[:, :, 0], smoothed, False)
+            gathered(back, weight, smoothed, image[:, :, 0], True)
+        else:
+            normal_product_affine(rows[0], rows[1], rows[2], rows[3], direction, image)
         length = energy / dot(direction, image)
-        step += length * direction
-        residual -= length * image
-        conditioned[:] = 0.0
+        for n in range(len(along)):
+            moved[n] += length * along[n]
+            left[n] -= length * pushed[n]
         block_products(inverse, residual, conditioned)
         previous, energy = energy, dot(residual, conditioned)
         if energy <= target:
             return step, iteration
-        direction *= energy / previous
-        direction += conditioned
+        for n in range(len(along)):
+            along[n] = along[n] * (energy / previous) + ready[n]
     return step, max_iterations
+
+
+@njit(cache=True)
+def edges_add(edges, directions, residual, diagonal, gradient):
+    """The diagonal blocks of an edge term, and its gradient, on what is there."""
+    for e in range(len(edges)):
+        for end in range(2):
+            block, sign = edges[e, end], 2 * end - 1
+            for i in range(3):
+                gradient[block, i, 0] += sign * directions[e, i] * residual[e]
+                for j in range(3):
+                    diagonal[block, i, j] += directions[e, i] * directions[e, j]
+
+
+@njit(cache=True)
+def edges_product(edges, directions, points, result):
+    """result += J^T J X of an edge term."""
+    for e in range(len(edges)):
+        start, end = edges[e, 0], edges[e, 1]
+        a, b, c = directions[e, 0], directions[e, 1], directions[e, 2]
+        longer = (
+            a * (points[end, 0] - points[start, 0])
+            + b * (points[end, 1] - points[start, 1])
+            + c * (points[end, 2] - points[start, 2])
+        )
+        a, b, c = a * longer, b * longer, c * longer
+        result[start, 0] -= a
+        result[start, 1] -= b
+        result[start, 2] -= c
+        result[end, 0] += a
+        result[end, 1] += b
+        result[end, 2] += c
+
+
+@njit(cache=True)
+def gathered(rows, factor, points, result, on_top):
+    """factor sum_n x_n c_kn of points for every row k, added or set."""
+    offsets, columns, coefficients = rows
+    for row in range(len(offsets) - 1):
+        a, b, c = 0.0, 0.0, 0.0
+        for entry in range(offsets[row], offsets[row + 1]):
+            n, share = columns[entry], coefficients[entry]
+            a += points[n, 0] * share
+            b += points[n, 1] * share
+            c += points[n, 2] * share
+        if on_top:
+            result[row, 0] += factor * a
+            result[row, 1] += factor * b
+            result[row, 2] += factor * c
+        else:
+            result[row, 0], result[row, 1], result[row, 2] = factor * a, factor * b, factor * c
 
 
 @njit(cache=True)
@@ -177,17 +344,9 @@ def rows_transpose(offsets, columns, coefficients, metric, residual, result):
                 result[column, 2, b] += p2 * c
 
 
-def rows_normal_product(offsets, columns, coefficients, metric, blocks, result):
-    """result += J^T M J X, one row after the other: where the time goes, so each width has its own loop."""
-    if coefficients.shape[1] == 1:
-        normal_product_points(offsets, columns, coefficients[:, 0], metric, blocks[:, :, 0], result[:, :, 0])
-    else:
-        normal_product_affine(offsets, columns, coefficients, metric, blocks, result)
-
-
 @njit(cache=True)
 def normal_product_points(offsets, columns, coefficients, metric, points, result):
-    """`rows_normal_product` of blocks that are points."""
+    """result += J^T M J X of blocks that are points, one row after the other: where the time goes."""
     for row in range(len(offsets) - 1):
         r0, r1, r2 = 0.0, 0.0, 0.0
         for entry in range(offsets[row], offsets[row + 1]):
@@ -195,9 +354,9 @@ def normal_product_points(offsets, columns, coefficients, metric, points, result
             r0 += points[column, 0] * c
             r1 += points[column, 1] * c
             r2 += points[column, 2] * c
-        p0 = metric[row, 0, 0] * r0 + metric[row, 0, 1] * r1 + metric[row, 0, 2] * r2
-        p1 = metric[row, 1, 0] * r0 + metric[row, 1, 1] * r1 + metric[row, 1, 2] * r2
-        p2 = metric[row, 2, 0] * r0 + metric[row, 2, 1] * r1 + metric[row, 2, 2] * r2
+        p0 = metric[row, 0] * r0 + metric[row, 1] * r1 + metric[row, 2] * r2
+        p1 = metric[row, 1] * r0 + metric[row, 3] * r1 + metric[row, 4] * r2
+        p2 = metric[row, 2] * r0 + metric[row, 4] * r1 + metric[row, 5] * r2
         for entry in range(offsets[row], offsets[row + 1]):
             column, c = columns[entry], coefficients[entry]
             result[column, 0] += p0 * c
@@ -207,10 +366,8 @@ def normal_product_points(offsets, columns, coefficients, metric, points, result
 
 @njit(cache=True)
 def normal_product_affine(offsets, columns, coefficients, metric, nodes, result):
-    """`rows_normal_product` of blocks that are affine maps."""
+    """The same of blocks that are affine maps."""
     for row in range(len(offsets) - 1):
-        if metric[row, 0, 0] == 0.0 and metric[row, 1, 1] == 0.0 and metric[row, 2, 2] == 0.0:
-            continue
         r0, r1, r2 = 0.0, 0.0, 0.0
         for entry in range(offsets[row], offsets[row + 1]):
             n = columns[entry]
@@ -218,9 +375,9 @@ def normal_product_affine(offsets, columns, coefficients, metric, nodes, result)
             r0 += nodes[n, 0, 0] * a + nodes[n, 0, 1] * b + nodes[n, 0, 2] * c + nodes[n, 0, 3] * d
             r1 += nodes[n, 1, 0] * a + nodes[n, 1, 1] * b + nodes[n, 1, 2] * c + nodes[n, 1, 3] * d
             r2 += nodes[n, 2, 0] * a + nodes[n, 2, 1] * b + nodes[n, 2, 2] * c + nodes[n, 2, 3] * d
-        p0 = metric[row, 0, 0] * r0 + metric[row, 0, 1] * r1 + metric[row, 0, 2] * r2
-        p1 = metric[row, 1, 0] * r0 + metric[row, 1, 1] * r1 + metric[row, 1, 2] * r2
-        p2 = metric[row, 2, 0] * r0 + metric[row, 2, 1] * r1 + metric[row, 2, 2] * r2
+        p0 = metric[row, 0] * r0 + metric[row, 1] * r1 + metric[row, 2] * r2
+        p1 = metric[row, 1] * r0 + metric[row, 3] * r1 + metric[row, 4] * r2
+        p2 = metric[row, 2] * r0 + metric[row, 4] * r1 + metric[row, 5] * r2
         for entry in range(offsets[row], offsets[row + 1]):
             n = columns[entry]
             for k in range(4):
@@ -249,6 +406,16 @@ def add_block_diagonal(offsets, columns, coefficients, metric, diagonal):
 
 
 @njit(cache=True)
+def upper_triangles(metric):
+    """The six numbers of symmetric 3x3 matrices."""
+    result = np.empty((len(metric), 6))
+    for n in range(len(metric)):
+        result[n, 0], result[n, 1], result[n, 2] = metric[n, 0, 0], metric[n, 0, 1], metric[n, 0, 2]
+        result[n, 3], result[n, 4], result[n, 5] = metric[n, 1, 1], metric[n, 1, 2], metric[n, 2, 2]
+    return result
+
+
+@njit(cache=True)
 def invert_points(matrices):
     """Inverses of symmetric positive 3x3 matrices, by their adjugates."""
     result = np.empty_like(matrices)
@@ -268,7 +435,7 @@ def invert_points(matrices):
 
 @njit(cache=True)
 def block_products(matrices, blocks, result):
-    """result += H_n X_n, block by block, on the flattened blocks."""
+    """H_n X_n, block by block, on the flattened blocks."""
     count, size = matrices.shape[0], matrices.shape[1]
     flat, out = blocks.reshape(count, size), result.reshape(count, size)
     for n in range(count):
@@ -276,4 +443,4 @@ def block_products(matrices, blocks, result):
             value = 0.0
             for j in range(size):
                 value += matrices[n, i, j] * flat[n, j]
-            out[n, i] += value
+            out[n, i] = value

@@ -11,14 +11,14 @@ from jaxtyping import Float64, Int32
 from capture4d.body.sewing_pattern import with_known_pattern
 from capture4d.captures.names import unknown_borders
 from capture4d.errors import InputError
-from capture4d.geometry.mesh import edge_uses, edges_of_faces, unique_edges
+from capture4d.geometry.mesh import doubled_area_vectors, edge_uses, edges_of_faces, normalised, unique_edges
 from capture4d.types import Garment
 from registration.config import RegistrationConfig
 from registration.deformation_graph import DeformationGraph, build_graph
 from registration.fold_lengths import edge_faces
 from registration.solver import Rows
 
-__all__ = ["Border", "TemplateAnalysis", "UnknownBorderError", "analyse_template", "require_borders"]
+__all__ = ["Border", "TemplateAnalysis", "UnknownBorderError", "analyse_template", "fold_cosines", "require_borders"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,19 +50,21 @@ class TemplateAnalysis:
     edge_faces: Int32[np.ndarray, "edges 2"]
     """The faces on both sides of each edge; on the border the one face twice."""
     rest_lengths: Float64[np.ndarray, " edges"]
+    rest_folds: Float64[np.ndarray, " edges"]
+    """`fold_cosines` at rest."""
     graph: DeformationGraph
     coarse_vertices: Int32[np.ndarray, " subset"]
     """Vertices that carry the coarse data term; border vertices are among them."""
     border: Border
     vertex_rows: Rows
     """Vertices as they are."""
-    edge_rows: Rows
-    """Edge vectors."""
     fan_offsets: Int32[np.ndarray, " verts_plus_1"]
     fan_faces: Int32[np.ndarray, " corners"]
     """Faces around vertex v: fan_faces[fan_offsets[v] : fan_offsets[v + 1]]."""
     laplacian_rows: Rows
     """Each vertex minus the mean of its neighbours; along the border, of its neighbours on the border."""
+    laplacian_columns: Rows
+    """The same, transposed."""
 
 
 def analyse_template(garment: Garment, config: RegistrationConfig) -> TemplateAnalysis:
@@ -78,6 +80,7 @@ def analyse_template(garment: Garment, config: RegistrationConfig) -> TemplateAn
     graph = build_graph(rest, faces, nodes=config.graph.nodes, nodes_per_vertex=config.graph.nodes_per_vertex)
     border = _border(garment)
     edges = unique_edges(faces)
+    sides, differences = edge_faces(faces, edges), _laplacian_rows(edges, faces, len(rest))
     lengths = rest_lengths(with_known_pattern(garment), edges)
     corners_per_vertex = np.bincount(faces.reshape(-1), minlength=len(rest))
     return TemplateAnalysis(
@@ -85,17 +88,28 @@ def analyse_template(garment: Garment, config: RegistrationConfig) -> TemplateAn
         faces=faces,
         rest=rest,
         edges=edges,
-        edge_faces=edge_faces(faces, edges),
+        edge_faces=sides,
         rest_lengths=lengths,
+        rest_folds=fold_cosines(rest, faces, sides),
         graph=graph,
         coarse_vertices=_coarse_vertices(len(rest), config.graph.vertices, border, faces),
         border=border,
-        vertex_rows=_rows([np.arange(len(rest))], [1.0]),
-        edge_rows=_rows([edges[:, 0], edges[:, 1]], [-1.0, 1.0]),
+        vertex_rows=Rows.of_points(np.arange(len(rest))),
         fan_offsets=np.concatenate([[0], np.cumsum(corners_per_vertex)]).astype(np.int32),
         fan_faces=(np.argsort(faces.reshape(-1), kind="stable") // 3).astype(np.int32),
-        laplacian_rows=_laplacian_rows(edges, faces, len(rest)),
+        laplacian_rows=differences,
+        laplacian_columns=differences.transposed(len(rest)),
     )
+
+
+def fold_cosines(
+    positions: Float64[np.ndarray, "verts 3"],
+    faces: Int32[np.ndarray, "faces 3"],
+    sides: Int32[np.ndarray, "edges 2"],
+) -> Float64[np.ndarray, " edges"]:
+    """Cosine between the normals of the faces on both sides of each edge, which are given by `sides`."""
+    normals = normalised(doubled_area_vectors(positions, faces))
+    return np.einsum("ea,ea->e", normals[sides[:, 0]], normals[sides[:, 1]])
 
 
 class UnknownBorderError(InputError):
@@ -154,13 +168,6 @@ def _coarse_vertices(count: int, wanted: int, border: Border, faces: np.ndarray)
     if 0 < wanted < len(used):
         used = np.random.default_rng(0).choice(used, wanted, replace=False)
     return np.union1d(used, border.vertices).astype(np.int32)
-
-
-def _rows(columns: list[np.ndarray], signs: list[float]) -> Rows:
-    entries = np.column_stack(columns).astype(np.int32)
-    width = len(columns)
-    coefficients = np.tile(np.array(signs), len(entries))[:, None]
-    return Rows(np.arange(0, entries.size + 1, width, dtype=np.int32), entries.reshape(-1), coefficients)
 
 
 def _laplacian_rows(edges: np.ndarray, faces: np.ndarray, count: int) -> Rows:

@@ -146,9 +146,21 @@ def unskin(
         transform of the joint with the largest weight instead, and should be given no weight.
     """
     blended = blend_transforms(skin_weights, transforms)
-    flagged = np.linalg.cond(blended[:, :, :3]) > SINGULAR_CONDITION
+    flagged = _near_singular(blended[:, :, :3])
     if flagged.any():
         dominant = np.argmax(skin_weights[flagged], axis=1)
         blended[flagged] = transforms[dominant, :3]
     rest = np.linalg.solve(blended[:, :, :3], (vertices - blended[:, :, 3])[..., None])[..., 0]
     return rest, flagged
+
+
+def _near_singular(matrices: Float64[np.ndarray, "verts 3 3"]) -> Bool[np.ndarray, " verts"]:
+    """Whether the condition number is above `SINGULAR_CONDITION`. Frobenius norms bound it from above and cost no
+    singular values; few matrices are doubtful then."""
+    first, second, third = matrices[:, 0], matrices[:, 1], matrices[:, 2]
+    adjugate = np.stack([np.cross(second, third), np.cross(third, first), np.cross(first, second)], axis=1)
+    determinant = np.abs(np.einsum("va,va->v", first, adjugate[:, 0]))
+    norms = np.linalg.norm(matrices, axis=(1, 2)) * np.linalg.norm(adjugate, axis=(1, 2))
+    flagged = ~(norms < SINGULAR_CONDITION * determinant)
+    flagged[flagged] = np.linalg.cond(matrices[flagged]) > SINGULAR_CONDITION
+    return flagged

@@ -42,14 +42,14 @@ class PointGrid:
         Args:
             cell: edge of a cell, metres: about three times the distance between the points.
         """
-        origin = points.min(axis=0)
-        extent = points.max(axis=0) - origin
-        cell = max(cell, 1e-6 * float(extent.max()), 1e-12)
-        while np.prod(np.floor(extent / cell) + 1) > MAX_CELLS:
+        origin, extent = box_of(points)
+        a, b, c = extent.tolist()
+        cell = max(cell, 1e-6 * max(a, b, c), 1e-12)
+        while (a // cell + 1) * (b // cell + 1) * (c // cell + 1) > MAX_CELLS:
             cell *= 1.25
-        x, y, z = (np.floor(extent / cell) + 1).astype(np.int64).tolist()
-        starts, order = sort_into_cells(points, origin, cell, x, y, z)
-        return PointGrid(origin, cell, (x, y, z), starts, points[order], order)
+        shape = int(a / cell) + 1, int(b / cell) + 1, int(c / cell) + 1
+        starts, order = sort_into_cells(points, origin, cell, *shape)
+        return PointGrid(origin, cell, shape, starts, points[order], order)
 
     def query(
         self, points: Float64[np.ndarray, "queries 3"], bound: float = np.inf
@@ -88,6 +88,16 @@ class PointGrid:
 
 
 @njit(cache=True)
+def box_of(points):
+    """Lowest corner and extent."""
+    low, high = points[0].copy(), points[0].copy()
+    for p in range(1, len(points)):
+        for axis in range(3):
+            low[axis], high[axis] = min(low[axis], points[p, axis]), max(high[axis], points[p, axis])
+    return low, high - low
+
+
+@njit(cache=True)
 def sort_into_cells(points, origin, cell, x, y, z):
     """Counting sort: offsets of the cells, and the points' indices in the order of their cells."""
     cells = np.empty(len(points), np.int32)
@@ -112,6 +122,7 @@ def sort_into_cells(points, origin, cell, x, y, z):
 def nearest_points(queries, bounds, directions, min_cosine, origin, cell, shape, starts, points, order, normals):
     """Cells in shells around each query, until no cell beyond can hold a nearer point."""
     x, y, z = shape
+    nearly = cell**2 * (1.0 - 1e-9)  # a point may lie beyond its cell by what rounding does
     choosy = len(directions) > 0
     distances, indices = np.full(len(queries), np.inf), np.full(len(queries), len(points), np.int64)
     for q in range(len(queries)):
@@ -131,6 +142,10 @@ def nearest_points(queries, bounds, directions, min_cosine, origin, cell, shape,
                     for k in range(k0 - shell, k0 + shell + 1, 1 if whole else 2 * shell):
                         if k < 0 or k >= z:
                             continue
+                        if shell > 0:
+                            beside = max(i - u, u - i - 1, 0.0) ** 2 + max(j - v, v - j - 1, 0.0) ** 2
+                            if (beside + max(k - w, w - k - 1, 0.0) ** 2) * nearly > best:
+                                continue
                         at = (i * y + j) * z + k
                         for p in range(starts[at], starts[at + 1]):
                             away = (points[p, 0] - a) ** 2 + (points[p, 1] - b) ** 2 + (points[p, 2] - c) ** 2

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float64, Integer
-from scipy.spatial import KDTree
 
+from capture4d.geometry.point_grid import PointGrid
 from capture4d.heavy_imports import njit
 
 __all__ = [
@@ -32,10 +32,13 @@ def self_intersections(
     """Which faces cut another face they share no vertex with."""
     corners = vertices[faces]
     centre = corners.mean(axis=1)
-    reach = np.sqrt(((corners - centre[:, None]) ** 2).sum(axis=2).max(axis=1))
+    offsets = corners - centre[:, None]
+    reach = np.sqrt(np.einsum("fca,fca->fc", offsets, offsets).max(axis=1))
     radius = 2.0 * float(np.percentile(reach, 99))
-    pairs = KDTree(centre, balanced_tree=False).query_pairs(radius, output_type="ndarray")
-    return intersecting_faces(vertices, faces, pairs)
+    cells = PointGrid.build(centre, radius)
+    return intersecting_faces(
+        vertices, faces, centre, radius, cells.origin, cells.cell, cells.shape, cells.starts, cells.order
+    )
 
 
 @njit(cache=True, inline="always")
@@ -151,32 +154,53 @@ def segment_cuts(vertices, start, end, a, b, c):
 
 
 @njit(cache=True)
-def intersecting_faces(vertices, faces, pairs):
-    """Marks the faces of those pairs that cut each other and share no vertex."""
-    cut = np.zeros(len(faces), np.bool_)
-    for n in range(len(pairs)):
-        f, g = faces[pairs[n, 0]], faces[pairs[n, 1]]
-        apart = False
+def intersecting_faces(vertices, faces, centres, radius, origin, cell, shape, starts, order):
+    """Marks faces that cut each other, share no vertex, and have centres within a radius, which is not above a cell.
+
+    The last five are of a `PointGrid` of the centres.
+    """
+    count = len(faces)
+    low, high, centre = np.empty((count, 3)), np.empty((count, 3)), np.empty((count, 3))
+    place = np.empty((count, 3), np.int64)
+    for n in range(count):  # in the order of the cells, so that neighbours lie beside each other in memory
+        f = order[n]
         for axis in range(3):
-            low_f = min(vertices[f[0], axis], vertices[f[1], axis], vertices[f[2], axis])
-            high_f = max(vertices[f[0], axis], vertices[f[1], axis], vertices[f[2], axis])
-            low_g = min(vertices[g[0], axis], vertices[g[1], axis], vertices[g[2], axis])
-            high_g = max(vertices[g[0], axis], vertices[g[1], axis], vertices[g[2], axis])
-            if low_f > high_g or low_g > high_f:
-                apart = True
-                break
-        for i in range(3):
-            for j in range(3):
-                if f[i] == g[j]:
-                    apart = True
-        if apart:
-            continue
-        for i in range(3):
-            j = (i + 1) % 3
-            if segment_cuts(vertices, f[i], f[j], g[0], g[1], g[2]) or (
-                segment_cuts(vertices, g[i], g[j], f[0], f[1], f[2])
-            ):
-                cut[pairs[n, 0]] = True
-                cut[pairs[n, 1]] = True
-                break
+            a, b, c = vertices[faces[f, 0], axis], vertices[faces[f, 1], axis], vertices[faces[f, 2], axis]
+            low[n, axis], high[n, axis], centre[n, axis] = min(a, b, c), max(a, b, c), centres[f, axis]
+            place[n, axis] = min(np.int64((centres[f, axis] - origin[axis]) / cell), shape[axis] - 1)
+    cut = np.zeros(count, np.bool_)
+    for n in range(count):
+        first, last = max(place[n, 2] - 1, 0), min(place[n, 2] + 1, shape[2] - 1)
+        for i in range(place[n, 0], min(place[n, 0] + 2, shape[0])):
+            for j in range(max(place[n, 1] - 1, 0), min(place[n, 1] + 2, shape[1])):
+                row = (i * shape[1] + j) * shape[2]
+                for m in range(max(starts[row + first], n + 1), starts[row + last + 1]):
+                    if (
+                        low[n, 0] > high[m, 0] or low[m, 0] > high[n, 0]
+                        or low[n, 1] > high[m, 1] or low[m, 1] > high[n, 1]
+                        or low[n, 2] > high[m, 2] or low[m, 2] > high[n, 2]
+                    ):  # fmt: skip
+                        continue
+                    away = 0.0
+                    for axis in range(3):
+                        away += (centre[n, axis] - centre[m, axis]) ** 2
+                    f, g = order[n], order[m]
+                    if away <= radius**2 and not (cut[f] and cut[g]) and faces_cut(vertices, faces[f], faces[g]):
+                        cut[f] = cut[g] = True
     return cut
+
+
+@njit(cache=True)
+def faces_cut(vertices, f, g):
+    """Whether two faces cut each other and share no vertex."""
+    for i in range(3):
+        for j in range(3):
+            if f[i] == g[j]:
+                return False
+    for i in range(3):
+        j = (i + 1) % 3
+        if segment_cuts(vertices, f[i], f[j], g[0], g[1], g[2]):
+            return True
+        if segment_cuts(vertices, g[i], g[j], f[0], f[1], f[2]):
+            return True
+    return False

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from registration.energies import plane_metric, rigid_term, stretch_metric, tangential_metric
+from registration.energies import plane_metric, rigid_term, stretch_metric, stretch_term, tangential_metric
 
 
 def rigid_energy(nodes: np.ndarray, weight: float, spacing: float) -> float:
@@ -44,6 +44,12 @@ def test_stretch_gradient() -> None:
 
     metric, residual = stretch_metric(ends, rest, weight=4.0, compression=0.3)
     gradient = np.einsum("eab,eb->ea", metric, residual)
+    vertices = np.concatenate([np.zeros((6, 3)), ends])
+    term = stretch_term(
+        vertices, np.column_stack([np.arange(6), np.arange(6, 12)]).astype(np.int32), rest, weight=4.0, compression=0.3
+    )
+    np.testing.assert_allclose(term.directions * term.residual[:, None], gradient, rtol=1e-12)
+    np.testing.assert_allclose(term.directions[:, :, None] * term.directions[:, None, :], metric, rtol=1e-12)
     for edge, axis in [(0, 0), (2, 1), (5, 2)]:
         more, less = ends.copy(), ends.copy()
         more[edge, axis] += 1e-6

@@ -5,13 +5,17 @@ import pytest
 
 from registration.solver import (
     BlockTerm,
+    EdgeTerm,
     Rows,
     RowTerm,
+    SmoothTerm,
     add_block_diagonal,
     gauss_newton_step,
     invert_points,
-    rows_normal_product,
+    normal_product_affine,
+    normal_product_points,
     rows_transpose,
+    upper_triangles,
 )
 
 BLOCKS, ROWS = 7, 30
@@ -46,6 +50,21 @@ def dense_metric(term: RowTerm) -> np.ndarray:
     return metric
 
 
+def normal_product(term: RowTerm, blocks: np.ndarray) -> np.ndarray:
+    """J^T M J X."""
+    rows, image = term.rows, np.zeros_like(blocks)
+    if blocks.shape[2] == 1:
+        normal_product_points(
+            rows.offsets, rows.columns, rows.coefficients[:, 0], upper_triangles(term.metric),
+            blocks[:, :, 0], image[:, :, 0],
+        )  # fmt: skip
+    else:
+        normal_product_affine(
+            rows.offsets, rows.columns, rows.coefficients, upper_triangles(term.metric), blocks, image
+        )
+    return image
+
+
 @pytest.mark.parametrize("width", [1, 4])
 def test_products_equal_the_assembled_matrix(width: int) -> None:
     rng = np.random.default_rng(width)
@@ -55,8 +74,7 @@ def test_products_equal_the_assembled_matrix(width: int) -> None:
     rows = (term.rows.offsets, term.rows.columns, term.rows.coefficients)
 
     x = rng.standard_normal((BLOCKS, 3, width))
-    image = np.zeros_like(x)
-    rows_normal_product(*rows, term.metric, x, image)
+    image = normal_product(term, x)
     np.testing.assert_allclose(image.ravel(), hessian @ x.ravel(), rtol=1e-12, atol=1e-12)
 
     gradient = np.zeros_like(x)
@@ -76,12 +94,9 @@ def test_products_equal_the_assembled_matrix(width: int) -> None:
 def test_normal_product_is_symmetric_and_never_negative() -> None:
     rng = np.random.default_rng(3)
     term = random_term(rng, 4)
-    rows = (term.rows.offsets, term.rows.columns, term.rows.coefficients)
     for _ in range(5):
         x, y = rng.standard_normal((2, BLOCKS, 3, 4))
-        image_x, image_y = np.zeros_like(x), np.zeros_like(y)
-        rows_normal_product(*rows, term.metric, x, image_x)
-        rows_normal_product(*rows, term.metric, y, image_y)
+        image_x, image_y = normal_product(term, x), normal_product(term, y)
         assert np.vdot(y, image_x) == pytest.approx(np.vdot(x, image_y), rel=1e-10)
         assert np.vdot(x, image_x) >= 0
 
@@ -102,6 +117,34 @@ def test_step_solves_the_normal_equations(width: int) -> None:
         hessian[n * size : (n + 1) * size, n * size : (n + 1) * size] += block.hessian[n]
     gradient = jacobian.T @ metric @ term.residual.ravel() + block.gradient.ravel()
     np.testing.assert_allclose(step.ravel(), -np.linalg.solve(hessian, gradient), rtol=1e-6, atol=1e-8)
+
+
+def test_terms_without_metrics_are_what_they_would_be_with_them() -> None:
+    """Lengths of edges, and smoothness, beside the same as rows with metrics; data on single points beside rows."""
+    rng = np.random.default_rng(20)
+    edges = np.array([(a, b) for a in range(BLOCKS) for b in range(a)], np.int32)
+    directions, length = rng.standard_normal((len(edges), 3)), rng.standard_normal(len(edges))
+    both = Rows(
+        np.arange(0, 2 * len(edges) + 1, 2, dtype=np.int32), edges.reshape(-1),
+        np.tile([-1.0, 1.0], len(edges))[:, None],
+    )  # fmt: skip
+    squares = (directions**2).sum(axis=1)
+    along = RowTerm(both, directions[:, :, None] * directions[:, None, :], (length / squares)[:, None] * directions)
+    rough = random_term(rng, 1)
+    even = RowTerm(rough.rows, np.tile(0.7 * np.eye(3), (ROWS, 1, 1)), rough.residual)
+    smooth = SmoothTerm(rough.rows, rough.rows.transposed(BLOCKS), 0.7, rough.residual)
+    some = np.array([5, 0, 3], np.int32)
+    root = rng.standard_normal((3, 3, 3))
+    metric, residual = root @ root.transpose(0, 2, 1), rng.standard_normal((3, 3))
+    plain = Rows(np.arange(4, dtype=np.int32), some, np.ones((3, 1)))
+
+    def solved(terms: list) -> np.ndarray:
+        return gauss_newton_step(terms, None, BLOCKS, damping=1e-6, tolerance=1e-12, max_iterations=500)[0]
+
+    quick = solved([RowTerm(Rows.of_points(some), metric, residual), EdgeTerm(edges, directions, length), smooth])
+    slow = solved([RowTerm(plain, metric, residual), along, even])
+    np.testing.assert_allclose(quick, slow, rtol=1e-8, atol=1e-9)
+    assert np.abs(quick).max() > 0.01
 
 
 def test_a_block_without_residuals_stays() -> None:

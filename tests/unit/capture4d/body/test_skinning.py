@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from capture4d.body.skinning import skin, unskin, with_pose, with_shape
+from capture4d.body.skinning import SINGULAR_CONDITION, _near_singular, skin, unskin, with_pose, with_shape
 from capture4d.errors import InputError
 from capture4d.types import Body, Mesh
 
@@ -91,3 +91,13 @@ def test_a_body_is_of_finite_numbers(name: str) -> None:
     broken[(0,) * broken.ndim] = np.nan
     with pytest.raises(InputError, match=rf"Body\.{name}: expected finite numbers"):
         replace(body, **{name: broken})
+
+
+def test_matrices_that_cannot_be_inverted_are_found_without_singular_values() -> None:
+    rng = np.random.default_rng(6)
+    matrices = rng.standard_normal((400, 3, 3))
+    matrices[::2, 2] = matrices[::2, 0] + 10.0 ** rng.uniform(-7, -1, (200, 1)) * matrices[::2, 2]
+    matrices[0] = 0
+    bad = np.linalg.cond(matrices) > SINGULAR_CONDITION
+    assert 20 < bad.sum() < 180
+    np.testing.assert_array_equal(_near_singular(matrices), bad)
