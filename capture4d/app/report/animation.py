@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float32
 
 from capture4d.app.drawing.charts import Line, joined_chart
 from capture4d.app.drawing.film import make_film, rows_around, tiled
@@ -156,8 +157,7 @@ def _page(
         "report.html.jinja",
         title=work.path.resolve().name,
         subtitle=f"{len(records)} frames, {len(records) / poses.fps:.1f} s at {poses.fps:g} fps; a learned garment of "
-        f"{len(template.vertices):,} vertices on a body of shape "
-        f"{', '.join(f'{value:.2g}' for value in poses.shape[:4])}. "
+        f"{len(template.vertices):,} vertices on a body of {_shape(poses.shape)}. "
         f"{acknowledgement(Path(stage['sources']['poses'])) or ''}",
         tiles=[
             Tile(shown(summary[key]), ANIMATION_METRICS[key][0], name)
@@ -225,3 +225,8 @@ def _charts(records: Sequence[Mapping[str, Any]]) -> Sequence[Chart]:
         lines = [Line(name, column(records, key), tint) for name, key, tint in curves]
         charts.append(Chart(title, joined_chart(frames, lines)))
     return charts
+
+
+def _shape(beta: Float32[np.ndarray, " betas"]) -> str:
+    """The first coefficients of a person, in words."""
+    return f"shape {', '.join(f'{value:.2g}' for value in beta[:4])}" if beta.any() else "mean shape"
