@@ -44,8 +44,11 @@ EXAMPLES: Mapping[str, Sequence[str]] = {
     "extract": ("extract capture --output work",),
     "track": ("track capture --output work",),
     "register": ("register capture --output work", "register capture --output work --tracked --preset paper"),
-    "run": ("run capture --output work", "run capture --output work --workers 8 --max-failed 2 --quiet",
-        "run capture --output work --scheduler tcp://head:8786"),
+    "run": (
+        "run capture --output work",
+        "run capture --output work --workers 8 --max-failed 2 --quiet",
+        "run capture --output work --scheduler tcp://head:8786",
+    ),
     "report": ("report work", "report work --fail-above fit_mean_mm=1.0 --fail-above frames_failed=0"),
     "status": ("status work", "status work --json"),
     "diff": ("diff before after", "diff before after --fail-if-worse fit_mean_mm=5"),

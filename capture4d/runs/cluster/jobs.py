@@ -105,7 +105,7 @@ def _client(cluster: Cluster) -> Any:
     except (OSError, ValueError, TypeError) as error:
         reason = " ".join(str(error).split())[:160]
         raise InputError(
-            f"--scheduler: expected a Dask scheduler at {cluster.address}, such as tcp://HOST:8786, found none ({reason})"
+            f"--scheduler: expected a scheduler such as tcp://HOST:8786, found none at {cluster.address} ({reason})"
         ) from None
     try:
         if not client.scheduler_info(n_workers=-1)["workers"]:
