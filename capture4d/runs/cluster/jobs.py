@@ -60,7 +60,7 @@ def cluster_jobs(
     places = {submitted(at): at for at in range(len(jobs))}
     given_up = [0] * len(jobs)
     try:
-        finished = as_completed(list(places))
+        finished = as_completed(list(places), loop=client.loop)
         for future in finished:
             at = places.pop(future)
             fault = future.exception()
