@@ -1,5 +1,7 @@
 """How two segments go together, and the frames between them."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -18,7 +20,7 @@ def test_one_fades_into_the_other_evenly(apart) -> None:
     count = faded(24)
     assert count == 16
     way = [first, *(blended(first, second, share_of_later(at, count)) for at in range(count)), second]
-    steps = [1e3 * np.linalg.norm(after - before, axis=1).mean() for before, after in zip(way, way[1:], strict=False)]
+    steps = [1e3 * np.linalg.norm(after - before, axis=1).mean() for before, after in pairwise(way)]
     np.testing.assert_allclose(steps, step_mm(first, second, count), rtol=1e-2)
     assert sum(steps) == pytest.approx(2.0, rel=1e-2)
 
