@@ -69,11 +69,11 @@ def run(*, quick: bool = False, frames: int = 2000, seed: int = 0) -> list[Metri
     """Track and register a long take three times.
 
     Args:
-        quick: 48 frames, in segments of 16.
+        quick: 40 frames, in two segments.
         frames: of the take.
         seed: of the small take that it is made of.
     """
-    console, count = Console(stderr=True), 48 if quick else frames
+    console, count = Console(stderr=True), 40 if quick else frames
     small = QUICK_TAKE if quick else replace(QUICK_TAKE, name="tiny-to-and-fro", frames=48, seed=seed)
     cut = Cut((16, 8), (16, 8), False) if quick else Cut((240, 24), (120, 24), True)
     take = read_capture(cached_take(small, workers=1))

@@ -142,7 +142,7 @@ class Chain:
             "settings": self.settings,
             "garment": self.garments[position],
             "lead": self.made(self.file(position, "leads")).digest,
-            "share": f"{share_of_later(position - fading.start, len(fading)):.6f}",
+            "share": repr(share_of_later(position - fading.start, len(fading))),
             "seam": self.made(self.seam(segment)).digest,
         }
 

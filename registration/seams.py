@@ -72,4 +72,5 @@ def blended(
     before: Float32[np.ndarray, "verts 3"], after: Float32[np.ndarray, "verts 3"], share: float
 ) -> Float32[np.ndarray, "verts 3"]:
     """A share of the later segment, and the rest of the earlier one."""
-    return ((1.0 - share) * before.astype(np.float64) + share * after).astype(np.float32)
+    start = before.astype(np.float64)
+    return (start + share * (after - start)).astype(np.float32)
