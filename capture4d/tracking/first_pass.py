@@ -35,6 +35,7 @@ from capture4d.runs.workers import run_jobs
 from capture4d.tracking.config import TrackingConfig
 from capture4d.tracking.sequence import NOTHING, Followed, Tracker, apart_mm
 from capture4d.tracking.take import TrackedTake, followed_frame, load_followed, numbers_of, prepared_take
+from capture4d.types import Body
 
 __all__ = ["Chain", "FirstPass", "FollowJob", "follow_frames", "require_found", "seams_of"]
 
@@ -144,13 +145,12 @@ class FirstPass:
         compared = list(leads)[-max(len(leads) // 3, 1) :]
         return [(self.take.stage.frame_path(each), leads[each]) for each in compared if leads]
 
-    def judge(self, segment: Segment) -> None:
+    def judge(self, segment: Segment, body: Body) -> None:
         """Compare a segment with the one before, in the last frame that both have found."""
         overlap = self._overlap(segment)
         found = [both for both in overlap if all(self.take.made(each).said["good"] for each in both)]
         apart, continues = None, bool(overlap) and bool(self.take.made(overlap[-1][0]).said["good"])
         if found:
-            body = load_body(self.take.stage.path / "body.npz")
             apart = apart_mm(body, *(load_followed(each).state for each in found[-1]))
             continues = continues and apart > self.take.config.sequence.seam_mm
         path, record = self.seam(segment), {"seam_mm": apart, "continues": continues}
@@ -197,9 +197,10 @@ def follow_frames(take: TrackedTake, workers: int) -> TrackedTake:
     """
     frame_ids, tried = take.capture.frame_ids, False
     while (todo := FirstPass.of(take, tried=tried).todo()).is_any:
-        for segment in todo.judge:
-            FirstPass.of(take).judge(segment)
         if todo.judge:
+            body = load_body(take.stage.path / "body.npz")
+            for segment in todo.judge:
+                FirstPass.of(take).judge(segment, body)
             continue
         ledger, stage = take.stage.ledger, take.stage
         replaced = [each for each in frame_ids if replaced_scan(ledger, stage.frame_path(each), take.capture, each)]
