@@ -193,7 +193,8 @@ def _make_up_tracking(capture: Capture, folder: Path) -> None:
         (folder / name).mkdir(exist_ok=True)
     np.savez(folder / "first.npz", rotations=model.rotations, translation=model.translation, shape=model.shape,
              shape_information=np.diag(0 * model.shape), numbers=np.array([0.0, 1, 0, 0]),
-             reasons=np.array([], np.str_), started_from=np.array("motion"), lost_frames=0, doubtful_frames=0)  # fmt: skip
+             reasons=np.array([], np.str_), started_from=np.array("motion"),
+             lost_frames=0, doubtful_frames=0)  # fmt: skip
     np.savez(folder / "second.npz", rotations=model.rotations.astype(np.float32),
              translation=model.translation.astype(np.float32), seen=np.ones(joints, bool))  # fmt: skip
     first, said = first_pass.FirstPass.of(take), {"nothing": False, "lost": False, "good": True, "lost_frames": 0}

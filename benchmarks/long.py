@@ -193,10 +193,11 @@ def _run_with_a_loss(folder: Path, cut: Cut, address: str) -> tuple[Outcome, int
     """On a cluster, one of whose workers is killed once a third of the frames is registered."""
     from distributed import Client
 
+    with Client(address, set_as_default=False) as client:
+        client.wait_for_workers(2)
+        pids = client.run(os.getpid)
     begin, output = time.perf_counter(), folder / "cluster"
     process = _start(folder, "cluster", cut, 1, address)
-    with Client(address, set_as_default=False) as client:
-        pids = client.run(os.getpid)
     wanted, killed = len(read_capture(folder / "capture").frame_ids) // 3, 0
     while not killed and process.returncode is None and not _has_ended(process):
         if len(list((output / "registration").glob("*/*.npz"))) >= wanted:
