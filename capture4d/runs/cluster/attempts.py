@@ -13,13 +13,15 @@ from pathlib import Path
 from capture4d.errors import InputError
 from capture4d.files.atomic import TEMPORARY_SUFFIX
 
-__all__ = ["MOST_KILLED", "begin_frame", "count_attempts", "end_frame"]
+__all__ = ["MOST_KILLED", "begin_frame", "count_attempts", "end_frame", "end_frames"]
 
 MOST_KILLED = 3
 """Workers that a frame may end."""
 
 _command: str | None = None
 """Name of the command for which this process counts attempts; None counts none."""
+_begun: set[Path] = set()
+"""Files that this process has begun."""
 
 
 def count_attempts(command: str | None) -> None:
@@ -40,6 +42,7 @@ def begin_frame(path: Path) -> None:
     killed = note.stat().st_size if note.is_file() else 0
     if killed >= MOST_KILLED:
         raise InputError(f"{killed} workers of the cluster were ended while they worked on this frame")
+    _begun.add(path)
     note.parent.mkdir(parents=True, exist_ok=True)
     with note.open("ab") as file:
         file.write(b".")
@@ -47,10 +50,17 @@ def begin_frame(path: Path) -> None:
 
 def end_frame(path: Path) -> None:
     """Note that it is done."""
+    _begun.discard(path)
     note = _note(path)
     if note is not None:
         with contextlib.suppress(FileNotFoundError):
             note.unlink()
+
+
+def end_frames() -> None:
+    """Note that this process is at none any more: it has come back, if with a fault."""
+    for path in [*_begun]:
+        end_frame(path)
 
 
 def _note(path: Path) -> Path | None:

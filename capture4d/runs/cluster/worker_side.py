@@ -11,7 +11,7 @@ from importlib import metadata
 from typing import Any
 
 from capture4d.errors import InputError
-from capture4d.runs.cluster.attempts import count_attempts
+from capture4d.runs.cluster.attempts import count_attempts, end_frames
 
 __all__ = ["THREAD_VARIABLES", "Work", "facts", "run_one", "same_bytes", "unfit"]
 
@@ -86,6 +86,8 @@ def run_one(name: str, pickled: bytes, job: bytes) -> Any:
         return work.function(*_given, pickle.loads(job)), None
     except InputError as error:
         return None, error
+    finally:
+        end_frames()
 
 
 def _opened(name: str, pickled: bytes) -> Work:
