@@ -41,9 +41,16 @@ class Lesson:
     person: ShapedBody
 
 
-def training_set(*, quick: bool, workers: int) -> tuple[TrainingSetConfig, Path]:
-    """The set and its folder; made if this machine has not made it before."""
+def training_set(*, quick: bool, workers: int, scans: bool = True) -> tuple[TrainingSetConfig, Path]:
+    """The set and its folder; made if this machine has not made it before.
+
+    Args:
+        scans: without them only the cloth is simulated, on the captured person, and of no clip that runs backwards.
+    """
     config = TRAINING_SETS["tiny-train" if quick else "tshirt-train"]
+    if not scans:
+        takes = {name: replace(take, scans=False) for name, take in config.takes.items() if name not in config.reversed}
+        config = replace(config, takes=takes, reversed=(), bodies={})
     return config, cached_training_set(config, workers=workers)
 
 

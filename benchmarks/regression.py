@@ -31,6 +31,7 @@ from retarget.regression.learning import (
     Projected,
     fitting_clips,
     learn_shapes,
+    learned_rows,
     predictions,
     regression_clips,
     vertex_error_m,
@@ -89,7 +90,7 @@ def run(
 
 def _methods(taken: Lesson, config: FitConfig, seeds: int) -> list[Metric]:
     takes, pieces = taken.takes, taken.pieces
-    space, _ = learn_shapes(takes, pieces, config.shape)
+    space, _ = learn_shapes(takes, learned_rows(takes, pieces), config.shape)
     fps = takes.takes[0].poses.fps
     projected: Projected = {}
     layout, own = (
@@ -154,7 +155,7 @@ def _network(
 ) -> Regressor:
     settings = replace(config, training=replace(config.training, seed=seed))
     with tempfile.TemporaryDirectory(prefix="capture4d-regression-") as scratch:
-        found = fit_lstm(clips, layout, std, Path(scratch), settings, linear=linear)
+        found = fit_lstm(clips, layout, std, Path(scratch), settings, linear=linear).regressor
         runs = [Path(scratch) / name / "metrics.jsonl" for name in ("training", "final")]  # first: with validation
         lines = next(path for path in runs if path.is_file()).read_text().splitlines()
     Console(stderr=True).print(f"seed {seed}: {len(lines)} epochs, {lines[-1]}", soft_wrap=True)

@@ -24,7 +24,7 @@ from data_synth.config import TrainingSetConfig
 from retarget.animation.animator import AnimatedFrame, Animator
 from retarget.animation.bodies import retargeted_mean
 from retarget.config import AnimateConfig, RemovalConfig, ShapeConfig
-from retarget.regression.learning import learn_shapes
+from retarget.regression.learning import learn_shapes, learned_rows
 from retarget.shapes.blendshapes import ShapeSpace, as_model_arrays, project
 
 METHODS = ("naive", "eq5", "default")
@@ -41,7 +41,7 @@ def run(*, quick: bool = False, workers: int = 2, tracked: bool = True, every: i
     """
     config, folder = training_set(quick=quick, workers=workers)
     taken = lesson(config, folder, truth=False, tracked=tracked and not quick, workers=workers)
-    space, _ = learn_shapes(taken.takes, taken.pieces, ShapeConfig())
+    space, _ = learn_shapes(taken.takes, learned_rows(taken.takes, taken.pieces), ShapeConfig())
     model = BlendshapeModel(
         taken.garment, *as_model_arrays(space), taken.person.body.joint_names, taken.takes.takes[0].poses.fps
     )

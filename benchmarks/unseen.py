@@ -7,9 +7,10 @@ inside_body_percent     vertices inside the body, worst frame (0.3)
 farthest_mm             any vertex to the skinned template's (150)
 failed_frames           (0)
 worst_ratio_to_skinned  vertex error over the skinned template's, where the cloth was simulated on the motion (1)
+like_taught_ratio       the same on the model's own clips: walk and hop, and the two that were held out (0.7)
 
-Models: that of the demo's take, and of `tshirt-train`; of two clips of `tiny-train` with --quick. All are learned from
-the true places of the template, but for `tshirt-train`, which is registered from its scans.
+Models: that of the demo's take, and of `tshirt-train`; of two clips of `tiny-train` with --quick, whose own clips are
+those two. All are learned from the true places of the template; with --scans `tshirt-train` is registered first.
 """
 
 from __future__ import annotations
@@ -56,6 +57,10 @@ UNTAUGHT = ("walk", "hop", "arm-circles")
 """Clips whose cloth is simulated. `tshirt-train` has seen the first two, and is measured on the last."""
 
 
+OWN = ("walk", "hop")
+"""What `tshirt-train` is measured on, beside the clips that it has held out."""
+
+
 @dataclass(frozen=True)
 class Model:
     """A learned garment, and the take that its truth is simulated like."""
@@ -64,6 +69,8 @@ class Model:
     folder: Path
     like: SynthConfig
     seen: tuple[str, ...] = ()
+    own: tuple[Path, ...] = ()
+    """Captures to measure on that are of its own kind: learned, or held out of the same set."""
 
 
 def run(
@@ -73,16 +80,19 @@ def run(
 
     Args:
         quick: a tiny model, few frames; the same keys.
-        mocap: a folder of BVH files, to move to as well; the cloth is simulated on those named *walk* and *hop*.
+        mocap: a folder of BVH files, to move to as well.
         frames: of each motion and simulated clip.
-        training: also the model of `tshirt-train`, for whose takes hours are needed the first time.
+        training: also the model of `tshirt-train`, for whose takes an hour is needed the first time.
+        scans: learn that from scans, which takes two hours more.
+        simulate: the cloth on those of the BVH files that are named *walk* or *hop*, too.
     """
     if mocap is not None and not mocap.is_dir():
         raise InputError("expected a folder of BVH files, found none", where=mocap)
     recorded = sorted(mocap.glob("*.bvh")) if mocap else []
     count = 16 if quick else frames
-    models = [_tiny(workers)] if quick else [_demo(workers), *([_trained(workers)] if training else [])]
+    models = [_tiny(workers)] if quick else [_demo(workers), *([_trained(workers, scans)] if training else [])]
     measured: list[Measured] = []
+    taught: list[Measured] = []
     for model in models:
         garment = load_garment_model(model.folder)
         for who in (None, HEAVY):
@@ -92,16 +102,18 @@ def run(
                 motions[path.stem] = _first(read_motion(path, garment.body, fps=garment.model.fps), count)
             for name, poses in motions.items():
                 measured.append(_measure(model, garment, name, poses, who, None))
-        for name, motion in _truths(model, recorded, quick).items():
+        for name, motion in _truths(model, recorded if simulate else [], quick).items():
             take = replace(model.like, name=f"{model.like.name}-{name}", motion=motion, frames=count, scans=False)
-            truth, _, poses, _ = true_take(read_capture(cached_take(take, workers=workers), scans=False))
-            measured.append(_measure(model, garment, f"{name} (simulated)", poses, None, np.asarray(truth.vertices)))
+            measured.append(_measure_take(model, garment, f"{name} (simulated)", cached_take(take, workers=workers)))
+        taught += [_measure_take(model, garment, f"{path.name} (its own)", path) for path in model.own]
+    measured += taught
     return [
         Metric("stretch_p99_worst", max(each.stretch for each in measured)),
         Metric("inside_body_percent", max(each.inside for each in measured), "%"),
         Metric("farthest_mm", max(each.farthest_mm for each in measured), "mm"),
         Metric("failed_frames", float(sum(each.failed for each in measured))),
         Metric("worst_ratio_to_skinned", max(each.ratio for each in measured if each.ratio is not None)),
+        *([Metric("like_taught_ratio", max(each.ratio or 0.0 for each in taught))] if taught else []),
     ]
 
 
@@ -114,29 +126,35 @@ def _fit(name: str, works: Sequence[Path], workers: int) -> Path:
     return folder
 
 
-def _true_works(name: str, takes: Sequence[SynthConfig], workers: int) -> list[Path]:
+def _true_works(name: str, captures: Sequence[Path]) -> list[Path]:
     root = user_cache_folder() / "works" / f"unseen-{name}"
-    captures = [read_capture(cached_take(take, workers=workers), scans=False) for take in takes]
-    return [write_true_work(capture, root / take.name) for capture, take in zip(captures, takes, strict=True)]
+    return [write_true_work(read_capture(path, scans=False), root / path.name) for path in captures]
 
 
 def _tiny(workers: int) -> Model:
     config = TRAINING_SETS["tiny-train"]
     takes = [replace(config.takes[name], scans=False) for name in TAUGHT]
-    return Model("tiny", _fit("tiny", _true_works("tiny", takes, workers), workers), takes[0], TAUGHT)
+    captures = tuple(cached_take(take, workers=workers) for take in takes)
+    return Model("tiny", _fit("tiny", _true_works("tiny", captures), workers), takes[0], TAUGHT, captures)
 
 
 def _demo(workers: int) -> Model:
     take = replace(PRESETS["demo"], scans=False)
-    return Model("demo", _fit("demo", _true_works("demo", [take], workers), workers), take)
+    return Model("demo", _fit("demo", _true_works("demo", [cached_take(take, workers=workers)]), workers), take)
 
 
-def _trained(workers: int) -> Model:
-    config, folder = training_set(quick=False, workers=workers)
+def _trained(workers: int, scans: bool) -> Model:
+    config, folder = training_set(quick=False, scans=scans, workers=workers)
     names = learned_takes(config)
-    works = registered_takes(config, folder, names, tracked=True, workers=workers)
+    captures = [folder / "takes" / name for name in names]
+    if scans:
+        works = registered_takes(config, folder, names, tracked=True, workers=workers)
+    else:
+        works = _true_works(config.name, captures)
     clips = tuple(config.takes[name].motion.clip for name in names)
-    return Model(config.name, _fit(config.name, works, workers), config.takes[names[0]], clips)
+    own = tuple(folder / "takes" / name for name in (*OWN, *config.held_out))
+    name = f"{config.name}-scans" if scans else config.name
+    return Model(name, _fit(name, works, workers), config.takes[names[0]], clips, own)
 
 
 def _truths(model: Model, recorded: Sequence[Path], quick: bool) -> dict[str, MotionConfig]:
@@ -168,6 +186,11 @@ def _first(poses: PoseSequence, frames: int) -> PoseSequence:
     return replace(
         poses, rotations=poses.rotations[kept], translations=poses.translations[kept], frame_ids=poses.frame_ids[kept]
     )
+
+
+def _measure_take(model: Model, garment: GarmentModel, name: str, capture: Path) -> Measured:
+    truth, _, poses, _ = true_take(read_capture(capture, scans=False))
+    return _measure(model, garment, name, poses, None, np.asarray(truth.vertices))
 
 
 def _measure(

@@ -42,8 +42,8 @@ from retarget.regression.learning import (
     UnposedTakes,
     examined,
     fitting_clips,
-    garment_at_rest,
     learn_shapes,
+    learned_rows,
     predictions,
     regression_clips,
     training_poses,
@@ -51,14 +51,21 @@ from retarget.regression.learning import (
 )
 from retarget.regression.linear import LinearRegressor, fit_linear, save_linear
 from retarget.regression.regressors import FittingClips, Regressor, mean_squared_error
-from retarget.regression.splits import ROLES, Piece, split_takes
-from retarget.shapes.blendshapes import ShapeSpace, as_model_arrays, project, shape_space, worst_errors
+from retarget.regression.splits import ROLES, Piece, Role, split_takes
+from retarget.shapes.blendshapes import (
+    ShapeSpace,
+    as_model_arrays,
+    project,
+    shape_space,
+    through_garment,
+    worst_errors,
+)
 from retarget.shapes.files import load_blendshapes, save_blendshapes
 from retarget.shapes.mirroring import Mirror, find_mirror
 
 __all__ = ["run"]
 
-SCHEMA = 6
+SCHEMA = 7
 EXAMINED_FRAMES = 1000
 """Kernels that only show how far they can be trusted learn from no more; time grows with the cube."""
 
@@ -165,16 +172,20 @@ def _blendshapes(stage: Stage, lesson: _Lesson, config: FitConfig) -> tuple[Blen
     if path.is_file() and note_path.is_file():
         return load_blendshapes(path), read_json(note_path)
     takes, body, person = lesson.takes, lesson.body, lesson.person
-    space, fewest = learn_shapes(takes, lesson.pieces, config.shape)
+    rows, training = learned_rows(takes, lesson.pieces), takes.rows(lesson.pieces, "training")
+    learned, fewest = learn_shapes(takes, rows, config.shape)
     garment = replace(with_body_shape(lesson.garment, body, person), body_shape=person)
+    space = through_garment(learned, garment.template.vertices, takes.vertices, rows)
     licence = config.licence or "none given"
     model = BlendshapeModel(garment, *as_model_arrays(space), body.joint_names, lesson.fps, licence)
     save_blendshapes(path, model)
-    note: dict[str, Any] = {"directions": len(space.std), "directions_for_max_error": fewest}
+    # frames that validated are no strangers to what was learned from them as well
+    alone = learned if len(rows) == len(training) else learn_shapes(takes, training, config.shape)[0]
+    note: dict[str, Any] = {"directions": len(learned.std), "directions_for_max_error": fewest}
     for role in ROLES:
         rows = takes.rows(lesson.pieces, role)
         if len(rows):
-            mean_m, worst_m = _shape_errors(takes, rows, space)
+            mean_m, worst_m = _shape_errors(takes, rows, alone if role == "validation" else space)
             note[f"{role.replace(' ', '_')}_frames"] = len(rows)
             note[f"{role.replace(' ', '_')}_shape_error_mm"] = {"mean": 1e3 * mean_m, "worst": 1e3 * worst_m}
     write_json(note_path, note)
@@ -205,13 +216,12 @@ def _regressors(
     clips = fitting_clips(lesson.takes, lesson.pieces, layout, space, mirror, projected)
     linear = fit_linear(clips, layout, space.std, config.linear)
     save_linear(stage.path / LINEAR, linear, model_digest=digest)
-    known_shapes = replace(
-        CoefficientRange.of(clips.all, space.std), resting=garment_at_rest(clips, _template_shape(stage, space))
-    )
-    chosen = replace(config.linear, ridges=(linear.ridge,))
-    trust = examined(clips, layout, known_shapes, lambda known: fit_linear(known, layout, space.std, chosen))
+    known_shapes = replace(CoefficientRange.of(clips.all, space.std), resting=_template_shape(stage, space))
+    chosen, count = replace(config.linear, ridges=(linear.ridge,)), read_json(stage.path / "shapes.json")["directions"]
+    trust = examined(clips, layout, known_shapes, count, lambda known: fit_linear(known, layout, space.std, chosen))
     ranges = {"linear": replace(ControlRange.of(clips.all, layout), trust=trust)}
-    kernel = network = None
+    linear_alone, kernel_alone = fit_linear(clips.settled, layout, space.std, chosen), None
+    kernel = network = network_alone = None
     if config.regressor != "linear":
         own = ControlLayout.create(lesson.body, lesson.takes.skin_weights, layout.fps, config.kernel.control)
         wider = fitting_clips(lesson.takes, lesson.pieces, own, space, mirror, projected)
@@ -220,29 +230,33 @@ def _regressors(
             save_kernel(stage.path / KERNEL, learned, model_digest=digest)
         kernel = load_kernel(stage.path / KERNEL, model_digest=digest)
         plain = _untuned(config.kernel, kernel.ridge)
-        trust = examined(wider, own, known_shapes, lambda known: fit_kernel(known, own, space.std, plain))
+        trust = examined(wider, own, known_shapes, count, lambda known: fit_kernel(known, own, space.std, plain))
         ranges["kernel"] = replace(ControlRange.of(wider.all, own), trust=trust)
+        kernel_alone = fit_kernel(wider.settled, own, space.std, plain)
     if config.regressor == "all":
-        network = _network(stage, clips, linear, space, config, device)
+        network, network_alone = _network(stage, clips, linear, space, config, device)
     known = KnownRange(poses, ranges, known_shapes)
     save_known_range(stage.path / POSES, known, model_digest=digest)
     note: dict[str, Any] = {
         "mirrored": mirror is not None,
-        "fades_to": "mean" if known_shapes.resting is None else "template",
         "control_numbers": layout.size,
         "joints": [layout.joint_names[j] for j in layout.joints],
     }
     ridges = {"linear": linear.ridge} if kernel is None else {"linear": linear.ridge, "kernel": kernel.ridge}
+    late = len(clips.all) > len(clips.training)  # those of training alone then tell how they validated
+    alone = regressors_by_name(known, linear_alone, network_alone, kernel_alone) if late else {}
     for name, regressor in regressors_by_name(known, linear, network, kernel).items():
         note[name] = {"ridge": ridges[name]} if name in ridges else {}
-        note[name] |= _errors(lesson, regressor, space, projected)
+        for role in ROLES:
+            asked = alone.get(name, regressor) if role == "validation" else regressor
+            note[name] |= _errors(lesson, asked, role, space, projected)
         if name in ranges:
             note[name]["trust"] = [{"degrees": degrees, "share": share} for degrees, share in ranges[name].trust.knots]
     return note
 
 
 def _template_shape(stage: Stage, space: ShapeSpace) -> Float32[np.ndarray, " shapes"]:
-    """The coefficients that come nearest to the template on the person of the takes."""
+    """The coefficients of the template on the person of the takes, which is in the space."""
     template = load_blendshapes(stage.path / MODEL).garment.template.vertices
     return project(space, template[None], np.ones((1, len(template)), np.float32))[0].astype(np.float32)
 
@@ -253,29 +267,29 @@ def _untuned(config: KernelConfig, ridge: float) -> KernelConfig:
     return replace(config, ridges=(ridge,), tuning=tuning, most_frames=min(config.most_frames, EXAMINED_FRAMES))
 
 
-def _errors(lesson: _Lesson, regressor: Regressor, space: ShapeSpace, projected: Projected) -> dict[str, Any]:
-    """How far a regressor is off, by the role of the takes."""
-    takes, pieces, found = lesson.takes, lesson.pieces, {}
-    for role in ROLES:
-        clips = regression_clips(takes, pieces, role, regressor.layout, space, None, projected)
-        if any(clip.good.any() for clip in clips):
-            error = vertex_error_m(takes, pieces, role, space, predictions(regressor, clips))
-            found[role.replace(" ", "_")] = {
-                "coefficient_mse_mm2": 1e6 * mean_squared_error(regressor, clips),
-                "vertex_error_mm": 1e3 * error,
-            }
-    return found
+def _errors(
+    lesson: _Lesson, regressor: Regressor, role: Role, space: ShapeSpace, projected: Projected
+) -> dict[str, Any]:
+    """How far a regressor is off on the takes of a role, if there are any."""
+    takes, pieces = lesson.takes, lesson.pieces
+    clips = regression_clips(takes, pieces, role, regressor.layout, space, None, projected)
+    if not any(clip.good.any() for clip in clips):
+        return {}
+    error = vertex_error_m(takes, pieces, role, space, predictions(regressor, clips))
+    measured = {"coefficient_mse_mm2": 1e6 * mean_squared_error(regressor, clips), "vertex_error_mm": 1e3 * error}
+    return {role.replace(" ", "_"): measured}
 
 
 def _network(
     stage: Stage, clips: FittingClips, linear: LinearRegressor, space: ShapeSpace, config: FitConfig, device: str
-) -> Regressor:
+) -> tuple[Regressor, Regressor]:
+    """The network, and the one of the training clips alone."""
     # torch takes a second to load
     from retarget.regression.lstm import load_lstm, save_lstm
     from retarget.regression.training import fit_lstm
 
     path, digest = stage.path / LSTM, shapes_digest(stage.path)
+    found = fit_lstm(clips, linear.layout, space.std, stage.path, config, linear=linear, device=device)
     if not path.is_file():
-        found = fit_lstm(clips, linear.layout, space.std, stage.path, config, linear=linear, device=device)
-        save_lstm(path, found, model_digest=digest)
-    return load_lstm(path, model_digest=digest, linear=linear)
+        save_lstm(path, found.regressor, model_digest=digest)
+    return load_lstm(path, model_digest=digest, linear=linear), found.alone

@@ -17,7 +17,7 @@ class CalibrationConfig:
     """Of all cameras: a pinhole with radial and tangential distortion, or an equidistant fisheye, for wide angles."""
     floor: str | None = None
     """Pose at which the board lies on the floor, printed side up: the world's origin and its Y axis."""
-    hold_out: Part = 0.15
+    held_out: Part = 0.15
     """Share of the poses that a second calibration leaves out and is measured on; 0 spares it."""
     flatness: bool = True
     """Solve once more with the shape of the board unknown."""

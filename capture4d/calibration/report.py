@@ -45,7 +45,7 @@ def calibration_report(
     cameras, grids = _cameras(calibration, board)
     residuals = _stacked(view_residuals(calibration.estimate, view) for view in calibration.views)
     links = _links(calibration.views, len(names))
-    held_out = _hold_out(calibration, board, config) if config.hold_out > 0 else []
+    held_out = _hold_out(calibration, board, config) if config.held_out > 0 else []
     return {
         "residual_median_px": _median(residuals),
         "residual_rms_px": _rms(residuals),
@@ -161,7 +161,7 @@ def _hold_out(calibration: Calibration, board: Board, config: CalibrationConfig)
     """Calibrate without some poses, and see how the rig that comes out sees them."""
     names = calibration.estimate.rig.names
     poses = [pose for pose, views in _by_pose(calibration.views).items() if len(views) >= 2]
-    wanted = min(max(1, round(config.hold_out * len(poses))), MOST_HELD_OUT)
+    wanted = min(max(1, round(config.held_out * len(poses))), MOST_HELD_OUT)
     held: set[int] = set()
     for index in np.linspace(0, len(poses) - 1, wanted + 2)[1:-1]:
         trial = held | {poses[round(float(index))]}

@@ -88,9 +88,11 @@ class _Count:
         self.total = total
         self._begun, self._first, self._counted, self._finished = time.monotonic(), completed, completed, finished
         self._before = finished() if finished else 0
+        self._warm: tuple[float, int] | None = None
 
     def advance(self, units: int) -> None:
         self._counted += units
+        self._warm = self._warm or (time.monotonic(), self.done)
 
     @property
     def done(self) -> int:
@@ -99,9 +101,18 @@ class _Count:
 
     def told(self, state: Literal["running", "stopped"], *, all_done: bool = False) -> _Told:
         done, elapsed = self.total if all_done else self.done, time.monotonic() - self._begun
-        new = done - self._first
-        left = 0.0 if done >= self.total else elapsed / new * (self.total - done) if new > 0 else None
-        return _Told(state, done, self.total, elapsed, left)
+        return _Told(state, done, self.total, elapsed, self._left_s(done, elapsed))
+
+    def _left_s(self, done: int, elapsed: float) -> float | None:
+        """By the pace since the first unit was done, as soon as more have followed than came with it: what went before
+        was spent on starting processes as well."""
+        new, left = done - self._first, self.total - done
+        if left <= 0 or new <= 0:
+            return 0.0 if left <= 0 else None
+        since, first = self._warm or (self._begun, self._first)
+        if done - first > first - self._first:
+            return (time.monotonic() - since) / (done - first) * left
+        return elapsed / new * left
 
 
 @dataclass(frozen=True, slots=True)

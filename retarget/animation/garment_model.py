@@ -53,7 +53,7 @@ class GarmentModel:
 
     @property
     def regressors(self) -> dict[str, Regressor]:
-        """Those that the model has, by name. Far from what they were taught they fade towards the mean garment."""
+        """Those that the model has, by name. Far from what they were taught they fade towards the template."""
         return regressors_by_name(self.limits, self.linear, self.lstm, self.kernel)
 
     @property

@@ -3,9 +3,9 @@
 A regressor is believed where it was taught, as far as takes that were left out have shown it right. The distance of two
 poses is the root mean square, over the garment's joints, of the angle between their rotations. Farther from every
 learned pose than is known to be safe, the regressor is asked about the nearest point that is safe, and its answer fades
-towards the mean garment. How the root moves and how
-the joints turn is judged part by part: beyond what was learned, a part fades towards its mean, so that what is left is
-what the pose alone can say. Coefficients stay within those of the learned frames.
+towards the garment at rest, which is the template. How the root moves and how the joints turn is judged part by part:
+beyond what was learned, a part fades towards its mean, so that what is left is what the pose alone can say.
+Coefficients stay within those of the learned frames.
 
 Letters: N learned frames, D controls, K coefficients.
 References: DeepWrinkles (ECCV 2018), section 5.3: retargeting works best near the training poses.

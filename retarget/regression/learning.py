@@ -38,8 +38,8 @@ __all__ = [
     "UnposedTakes",
     "examined",
     "fitting_clips",
-    "garment_at_rest",
     "learn_shapes",
+    "learned_rows",
     "predictions",
     "regression_clips",
     "training_poses",
@@ -91,13 +91,20 @@ class UnposedTakes:
         return np.concatenate([take.transforms for take in self.takes])
 
 
-def learn_shapes(takes: UnposedTakes, pieces: Sequence[Piece], config: ShapeConfig) -> tuple[ShapeSpace, int | None]:
-    """The shape space of the training frames, cut where the error allows, and how many directions that takes.
+def learned_rows(takes: UnposedTakes, pieces: Sequence[Piece]) -> Int64[np.ndarray, " rows"]:
+    """Rows of the good frames that are learned from in the end: of training, and of takes that have validated."""
+    training, late = _learned_pieces(pieces)
+    return np.concatenate([takes.rows(training, "training"), takes.rows(late, "validation")])
+
+
+def learn_shapes(
+    takes: UnposedTakes, rows: Int64[np.ndarray, " rows"], config: ShapeConfig
+) -> tuple[ShapeSpace, int | None]:
+    """The shape space of some frames, cut where the error allows, and how many directions that takes.
 
     Returns:
         The space, and the fewest directions that keep to `config.max_error_mm` (None: all there are do not).
     """
-    rows = takes.rows(pieces, "training")
     space = learn_shape_space(takes.vertices, takes.weights, rows, config, np.random.default_rng(0))
     fewest = fewest_directions(
         space, takes.vertices, takes.weights, rows, takes.transforms, takes.skin_weights,
@@ -227,47 +234,31 @@ def examined(
     clips: FittingClips,
     layout: ControlLayout,
     coefficients: CoefficientRange,
+    learned: int,
     fit: Callable[[FittingClips], Regressor],
 ) -> Trust:
     """How far a regressor's answers can be believed, shown on each take by what was learned from the others; of an only
     take, on its end.
 
     Args:
+        learned: directions that the takes have taught. The one beyond them is the template's alone: that no learned
+            frame has anything of it is no evidence.
         fit: learns from clips, with settings that are chosen already.
     """
-    resting = 0.0 if coefficients.resting is None else coefficients.resting
+    resting = np.zeros_like(coefficients.std) if coefficients.resting is None else coefficients.resting
     distances, answers, truth = [], [], []
     for known, asked in _left_out(clips):
         if sum(int(clip.good.sum()) for clip in known) < LEAST_TAUGHT:
             continue
-        learned, reach = fit(FittingClips(known, (), known)), ControlRange.of(known, layout)
+        regressor, reach = fit(FittingClips(known, (), known)), ControlRange.of(known, layout)
         for clip in asked:
             controls, _ = reach.bounded(clip.controls, layout, np.inf)
             distances.append(reach.distances(clip.controls, layout)[clip.good])
-            answers.append(coefficients.inside(learned.predict(controls))[clip.good] - resting)
-            truth.append(clip.coefficients[clip.good] - resting)
+            answers.append((coefficients.inside(regressor.predict(controls))[clip.good] - resting)[:, :learned])
+            truth.append((clip.coefficients[clip.good] - resting)[:, :learned])
     if not distances:
         return Trust.whole()
     return Trust.of(np.concatenate(distances), np.concatenate(answers), np.concatenate(truth))
-
-
-def garment_at_rest(
-    clips: FittingClips, template: Float32[np.ndarray, " shapes"]
-) -> Float32[np.ndarray, " shapes"] | None:
-    """What is left where no answer is believed: the template, if takes that were left out are nearer to it than to the
-    mean of the others; else the mean garment, None.
-
-    Args:
-        template: its coefficients, on the person of the takes.
-    """
-    errors = np.zeros(2)
-    for known, asked in _left_out(clips):
-        learned = [clip.coefficients[clip.good] for clip in known if clip.good.any()]
-        truth = [clip.coefficients[clip.good] for clip in asked if clip.good.any()]
-        if learned and truth:
-            mean, true = np.concatenate(learned).mean(axis=0), np.concatenate(truth).astype(np.float64)
-            errors += ((true - mean) ** 2).sum(), ((true - template) ** 2).sum()
-    return template if errors[1] < errors[0] else None
 
 
 def _left_out(clips: FittingClips) -> list[tuple[Sequence[Clip], Sequence[Clip]]]:

@@ -32,7 +32,7 @@ from retarget.regression.linear import LinearRegressor, fit_linear
 from retarget.regression.lstm import EncoderDecoder, LstmRegressor, frame_windows, usable_device
 from retarget.regression.regressors import Clip, FittingClips, Scales, mean_squared_error, usual_response, with_history
 
-__all__ = ["Batch", "TrainedLstm", "TrainingState", "fit_lstm", "train_lstm", "train_step"]
+__all__ = ["Batch", "FittedLstm", "TrainedLstm", "TrainingState", "fit_lstm", "train_lstm", "train_step"]
 
 _KIND = "capture4d lstm training"
 _CHECKPOINT = "last.safetensors"
@@ -46,6 +46,13 @@ class TrainedLstm(NamedTuple):
 
     regressor: LstmRegressor
     epochs: int
+
+
+class FittedLstm(NamedTuple):
+    """A network of all clips, and one of the training clips alone, which shows how it validated."""
+
+    regressor: LstmRegressor
+    alone: LstmRegressor
 
 
 @dataclass(slots=True, eq=False)
@@ -100,7 +107,7 @@ def fit_lstm(
     *,
     linear: LinearRegressor,
     device: str = "cpu",
-) -> LstmRegressor:
+) -> FittedLstm:
     """Train on some clips until those that validate get no better; then as long on all of them.
 
     Args:
@@ -112,18 +119,20 @@ def fit_lstm(
     """
     everything = FittingClips(clips.all, (), clips.all)
     if not clips.validation:
-        return train_lstm(everything, layout, std, folder / "final", config, linear=linear, device=device).regressor
+        found = train_lstm(everything, layout, std, folder / "final", config, linear=linear, device=device)
+        return FittedLstm(found.regressor, found.regressor)
     alone = fit_linear(clips.settled, layout, std, replace(config.linear, ridges=(linear.ridge,)))
     found = train_lstm(clips, layout, std, folder / "training", config, linear=alone, device=device)
     if len(clips.all) == len(clips.training):
-        return found.regressor
+        return FittedLstm(found.regressor, found.regressor)
     epochs = config.training.epochs or _usual_epochs(
         sum(int(clip.good.sum()) for clip in clips.training), config.training
     )
     settled = replace(config, training=replace(config.training, epochs=epochs))
-    return train_lstm(
+    final = train_lstm(
         everything, layout, std, folder / "final", settled, linear=linear, device=device, stop_after=found.epochs
-    ).regressor
+    )
+    return FittedLstm(final.regressor, found.regressor)
 
 
 def _usual_epochs(windows: int, config: TrainingConfig) -> int:

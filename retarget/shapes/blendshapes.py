@@ -34,6 +34,7 @@ __all__ = [
     "reconstruct",
     "shape_space",
     "skin_frames",
+    "through_garment",
     "worst_errors",
 ]
 
@@ -46,6 +47,8 @@ FILLED = 1e-4
 """Rounds of filling end when the unseen vertices move less than this, metres, root mean square."""
 SEEN = 0.5
 """Vertices below this weight count for no error."""
+SAME_M = 1e-6
+"""A garment that the directions miss by less is in the space already, metres, root mean square over the vertices."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,6 +102,34 @@ def learn_shape_space(
         if spread < FILLED:
             break
     return space
+
+
+def through_garment(
+    space: ShapeSpace,
+    garment: Float[np.ndarray, "verts 3"],
+    frames: Float[np.ndarray, "frames verts 3"],
+    rows: Integer[np.ndarray, " kept"],
+) -> ShapeSpace:
+    """The space with one more direction, the last, if it takes one to reach a garment: what that has beyond the others.
+
+    Args:
+        garment: unposed, metres.
+        frames: unposed, metres; may lie on disk.
+        rows: the frames that were learned from, for the spread along the direction.
+    """
+    missed = garment - space.mean
+    for _ in range(2):  # once more, for what rounding has left
+        missed = missed - np.tensordot(np.tensordot(space.basis, missed, 2), space.basis, 1)
+    length = float(np.linalg.norm(missed))
+    if length <= SAME_M * np.sqrt(len(garment)):
+        return space
+    direction = missed / length
+    squares = 0.0
+    for block in blocks(len(rows), 3 * frames.shape[1]):
+        offsets = np.asarray(frames[rows[block]], np.float64) - space.mean
+        squares += float((np.tensordot(offsets, direction, 2) ** 2).sum())
+    spread = np.sqrt(squares / max(len(rows), 1))
+    return ShapeSpace(space.mean, np.concatenate([space.basis, direction[None]]), np.append(space.std, spread))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -131,6 +131,8 @@ class ScheduleConfig:
     """Share of the steps after which the learning rate falls linearly to zero."""
     checkpoint_every: Count = 500
     """Steps between checkpoints."""
+    checkpoint_s: NonNegative = 60.0
+    """Seconds after which there is one in any case; they change nothing in the result."""
     sample_every: Count = 500
     """Steps between sheets of sample maps."""
     log_every: Count = 20

@@ -11,6 +11,7 @@ takes.json                 digests of the registrations it learned from
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -169,6 +170,7 @@ def _train(
     schedule = config.schedule
     rows = _logged(stage.path / "metrics.jsonl", state.step)
     stream = batches(train, size=schedule.batch, seed=config.seed, start=state.step, crop=config.crop)
+    saved = time.monotonic()
     with progress("train", schedule.steps, completed=state.step) as advance:
         while state.step < schedule.steps:
             recent.append(train_step(state, next(stream), config))
@@ -180,9 +182,11 @@ def _train(
                 recent.clear()
             if state.step % schedule.sample_every == 0 or last:
                 _write_samples(stage, state, held, config)
-            if state.step % schedule.checkpoint_every == 0 or last:
+            late = time.monotonic() - saved >= schedule.checkpoint_s
+            if state.step % schedule.checkpoint_every == 0 or late or last:
                 _write_log(stage.path / "metrics.jsonl", rows)
                 _save(stage, state, recent)
+                saved = time.monotonic()
 
 
 def _checkpoint(stage: Stage, step: int) -> Path:

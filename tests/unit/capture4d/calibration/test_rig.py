@@ -131,7 +131,7 @@ def test_a_bent_board_shows_in_the_flatness():
 
     warped = Bent(BOARD.columns, BOARD.rows, BOARD.square_m, BOARD.marker_m, BOARD.dictionary)
     views = simulate_views(rig, warped, poses, errors=[0.03 * rng.normal(size=(500, 2))], rng=rng)
-    config = CalibrationConfig(hold_out=0)
+    config = CalibrationConfig(held_out=0)
     names = [f"{pose:03d}" for pose in range(POSES)]
     report = calibration_report(calibrated(rig, views), BOARD, pose_names=names, config=config)
     assert report["flatness"]["out_of_plane_max_mm"] > 0.3
@@ -171,7 +171,7 @@ def test_the_scale_of_a_pose_does_not_depend_on_how_the_board_is_held():
         replace(calibration, views=few),
         BOARD,
         pose_names=[f"{pose:03d}" for pose in range(POSES)],
-        config=CalibrationConfig(hold_out=0, flatness=False),
+        config=CalibrationConfig(held_out=0, flatness=False),
     )
     scales = [row["scale_ppm"] for row in report["volume"] if row["scale_ppm"] is not None]
     assert len(scales) > 4

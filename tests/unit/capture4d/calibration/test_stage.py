@@ -103,7 +103,7 @@ def test_corners_are_detected_once(shoot, tmp_path: Path, monkeypatch: pytest.Mo
         raise AssertionError("detected again")
 
     monkeypatch.setattr("capture4d.calibration.stage.detect_corners", never)
-    assert run(*calibrate(folder / "images", tmp_path / "rig.json", "--hold-out", "0", "--no-flatness")) == 0
+    assert run(*calibrate(folder / "images", tmp_path / "rig.json", "--held-out", "0", "--no-flatness")) == 0
     first, second = (load_rig(path / "rig.json").T_camera_world for path in (folder, tmp_path))
     np.testing.assert_allclose(first, second, atol=1e-7)
 
@@ -152,15 +152,15 @@ def test_a_rig_of_other_settings_is_not_replaced_unasked(shoot, tmp_path: Path, 
         if path.is_file():
             shutil.copy(path, tmp_path / path.name)
     rig, before = tmp_path / "rig.json", (folder / "rig.json").read_bytes()
-    other = ("--hold-out", "0", "--no-flatness")
+    other = ("--held-out", "0", "--no-flatness")
     said = fails(capsys, *calibrate(folder / "images", rig, *other))
     assert said == (
-        f"{tmp_path / 'calibration_stage.json'}: was made with other settings (hold_out 0.15 to 0.0, flatness true to "
+        f"{tmp_path / 'calibration_stage.json'}: was made with other settings (held_out 0.15 to 0.0, flatness true to "
         "false); with --overwrite the same command makes it anew, and keeps what it is made from"
     )
     assert rig.read_bytes() == before
     assert run(*calibrate(folder / "images", rig, *other, "--overwrite")) == 0
-    assert json.loads((tmp_path / "calibration.json").read_text())["config"]["hold_out"] == 0
+    assert json.loads((tmp_path / "calibration.json").read_text())["config"]["held_out"] == 0
     (tmp_path / "calibration_stage.json").unlink()
     assert run(*calibrate(folder / "images", rig, *other)) == 0, "this very rig"
 
@@ -219,7 +219,7 @@ def test_an_image_that_cannot_be_read_does_not_cost_those_that_can(
     seen = []
     detect = calibration_stage.detect_corners
     monkeypatch.setattr(calibration_stage, "detect_corners", lambda *a: seen.append(1) or detect(*a))
-    assert run(*calibrate(images, rig, "--hold-out", "0", "--no-flatness")) == 0
+    assert run(*calibrate(images, rig, "--held-out", "0", "--no-flatness")) == 0
     assert len(seen) == 1
 
 

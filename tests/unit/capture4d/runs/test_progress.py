@@ -128,3 +128,17 @@ def test_a_terminal_gets_a_bar(capsys: pytest.CaptureFixture[str], monkeypatch: 
 def test_jobs_are_counted_in_their_units(capsys: pytest.CaptureFixture[str]):
     assert sorted(run_jobs(len, ["ab", "c"], workers=1, label="words", units=len)) == [1, 2]
     assert lines(capsys) == ["words: 0 of 3, TIME gone", "words: 3 of 3 in TIME"]
+
+
+def test_the_time_left_forgets_how_long_it_took_to_begin(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    monkeypatch.setattr(progress_module.time, "monotonic", lambda: now[0])
+    count = progress_module._Count(100, 20, None)
+    assert count.told("running").left_s is None
+    now[0] = 30.0
+    count.advance(1)
+    assert count.told("running").left_s == 30 * 79, "one unit is all that is known"
+    for _ in range(9):
+        now[0] += 1
+        count.advance(1)
+    assert count.told("running").left_s == pytest.approx(70)

@@ -318,7 +318,7 @@ def test_a_run_that_stopped_anywhere_ends_with_the_same_bits(clips, tmp_path: Pa
 
     def go(folder: Path) -> LstmRegressor:
         if fitted:
-            return fit_lstm(lesson, layout(), spread(known), folder, config, linear=linear)
+            return fit_lstm(lesson, layout(), spread(known), folder, config, linear=linear).regressor
         return train_lstm(lesson, layout(), spread(known), folder, config).regressor
 
     whole = go(tmp_path / "whole")

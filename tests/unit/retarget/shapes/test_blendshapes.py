@@ -14,6 +14,7 @@ from retarget.shapes.blendshapes import (
     project,
     reconstruct,
     skin_frames,
+    through_garment,
     worst_errors,
 )
 
@@ -53,6 +54,21 @@ def test_directions_are_orthonormal_and_their_spread_is_that_of_the_coefficients
     np.testing.assert_allclose(project(space, frames).std(axis=0), space.std, rtol=1e-9)
     assert (np.diff(space.std) <= 0).all()
     assert len(space.basis) == 5
+
+
+def test_one_more_direction_reaches_a_garment_that_was_never_learned() -> None:
+    frames, mean = low_rank()
+    space, rows = learned(frames, components=3), np.arange(len(frames))
+    garment = mean + 0.2 * np.random.default_rng(8).standard_normal(mean.shape)
+    wider = through_garment(space, garment, frames, rows)
+    assert len(wider.basis) == 4
+    flat = wider.basis.reshape(4, -1)
+    np.testing.assert_allclose(flat @ flat.T, np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(
+        reconstruct(wider.mean, wider.basis, project(wider, garment[None]))[0], garment, atol=1e-12
+    )
+    np.testing.assert_allclose(np.sqrt((project(wider, frames)[:, -1] ** 2).mean()), wider.std[-1], rtol=1e-9)
+    assert through_garment(wider, garment, frames, rows) is wider, "it is in the space already"
 
 
 @pytest.mark.parametrize("decay", ["steep", "flat"])

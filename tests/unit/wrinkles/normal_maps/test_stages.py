@@ -412,6 +412,26 @@ def test_an_interrupted_training_ends_with_the_same_weights(
         assert (tmp_path / "again" / name).read_bytes() == (trained / name).read_bytes(), name
 
 
+def test_a_long_training_is_saved_by_the_clock_too(
+    work: Path, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    rarely = ("--schedule.checkpoint-every", "100", "--schedule.checkpoint-s", "0")
+    step, done = train_stage.train_step, []
+
+    def stopping(*arguments: object) -> dict[str, float]:
+        done.append(1)
+        if len(done) == 4:
+            raise KeyboardInterrupt
+        return step(*arguments)  # pyright: ignore
+
+    monkeypatch.setattr(train_stage, "train_step", stopping)
+    assert run(*train(work, tmp_path / "again", *rarely)) == 130
+    assert run(*train(work, tmp_path / "again", *rarely)) == 0
+    assert len(done) == 4 + 3, "three of the six steps were kept"
+    name = "generator.safetensors"
+    assert (tmp_path / "again" / name).read_bytes() == (trained / name).read_bytes()
+
+
 @pytest.mark.slow
 def test_a_killed_training_ends_with_the_same_weights(work: Path, tmp_path: Path):
     more = ("--schedule.steps", "60")
