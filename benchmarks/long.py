@@ -69,7 +69,7 @@ def run(*, quick: bool = False, frames: int = 2000, seed: int = 0) -> list[Metri
     """Track and register a long take three times.
 
     Args:
-        quick: 40 frames, in two segments.
+        quick: 40 frames, in three segments.
         frames: of the take.
         seed: of the small take that it is made of.
     """
