@@ -189,19 +189,23 @@ def _make_up_tracking(capture: Capture, folder: Path) -> None:
     take = TrackedTake(capture, stage, config, take_colours(capture))
     model = take.tracker().model.rest_state()
     joints = len(body.joint_names)
-    for name in ("frames", "refined", "metrics"):
+    for name in ("frames", "leads", "refined", "metrics"):
         (folder / name).mkdir(exist_ok=True)
     np.savez(folder / "first.npz", rotations=model.rotations, translation=model.translation, shape=model.shape,
-             shape_information=np.zeros((2, 2)), reasons=np.array([], np.str_), numbers=np.array([0.0, 1, 0, 0]),
-             started_from=np.array("motion"), lost_frames=0, doubtful_frames=0)  # fmt: skip
+             shape_information=np.diag(0 * model.shape), numbers=np.array([0.0, 1, 0, 0]),
+             reasons=np.array([], np.str_), started_from=np.array("motion"),
+             lost_frames=0, doubtful_frames=0)  # fmt: skip
     np.savez(folder / "second.npz", rotations=model.rotations.astype(np.float32),
              translation=model.translation.astype(np.float32), seen=np.ones(joints, bool))  # fmt: skip
-    settings, chain = take.settings_digest(), first_pass.Chain()
-    said = {"nothing": False, "lost": False, "lost_frames": 0}
-    for frame_id, path in _paths(capture, folder / "frames"):
-        made = _put(capture, folder / "first.npz", path, frame_id, chain.inputs(settings, frame_id))
-        stage.ledger.note(path, replace(made, said=said))
-        chain = chain.followed_by(path, replace(made, said=said))
+    first, said = first_pass.FirstPass.of(take), {"nothing": False, "lost": False, "good": True, "lost_frames": 0}
+    for segment in take.segments:
+        chain = first_pass.Chain()
+        for frame_id, path in [*first.leads(segment).items(), *first.frames(segment).items()]:
+            made = _put(capture, folder / "first.npz", path, frame_id, chain.inputs(first.settings, frame_id))
+            stage.ledger.note(path, replace(made, said=said))
+            chain = chain.followed_by(path, replace(made, said=said))
+        if segment.index:
+            first.judge(segment, body)
     for job in second_pass.refine_jobs(take, take_shape(take)):
         path = stage.frame_path(job.frame_id, folder="refined")
         stage.ledger.note(path, _put(capture, folder / "second.npz", path, job.frame_id, job.inputs))

@@ -44,7 +44,7 @@ from capture4d.types import Body, Garment, Mesh, PoseSequence
 from data_synth.config import PRESETS, GarmentStyle, MotionConfig, SynthConfig
 from registration.config import RegistrationConfig
 from registration.predictions import Mover
-from registration.sequence import register_run, segments
+from registration.sequence import register_run
 from registration.template import analyse_template
 
 KINDS: dict[str, Callable[[Mesh], np.ndarray] | None] = {
@@ -145,11 +145,10 @@ def _error_mm(capture: Capture, garments: Path, garment: Garment, truth: np.ndar
     row = {frame_id: index for index, frame_id in enumerate(capture.frame_ids)}
     errors = [
         correspondence_errors(result.vertices, truth[row[result.frame_id]]).mean()
-        for positions in segments(None, len(capture.frame_ids), config.sequence)
         for result in register_run(
             analysis,
             mover,
-            positions,
+            range(len(capture.frame_ids)),
             capture.frame_ids,
             load=lambda frame_id: load_garment_scan(garments / "frames" / f"{frame_id:06d}.npz", frame_id),
             done=lambda _, __: None,

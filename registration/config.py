@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from dataclasses import field
 from typing import Annotated, Literal
 
-from capture4d.settings import Cosine, Count, Degrees, NonNegative, Percent, Positive, Range, Share, Whole, settings
+from capture4d.settings import Cosine, Count, NonNegative, Percent, Positive, Range, Share, Whole, settings
 
 __all__ = [
     "PAPER",
@@ -158,11 +158,15 @@ class DenseConfig:
 class SequenceConfig:
     """How a take is cut up and where each frame starts."""
 
-    segment: Count = 240
-    """Fewest frames between keyframes. Segments start from keyframes and run in parallel; shorter ones are faster on
-    many cores, and forget more often how the cloth has slid."""
-    keyframe_bend_deg: Degrees = 8.0
-    """A keyframe's joints are at most this far from the rest pose, root mean square, degrees; 0 makes one segment."""
+    segment: Count = 120
+    """Frames of a segment. Segments are registered side by side, on as many processes and machines as there are, and
+    joined."""
+    overlap: Whole = 24
+    """Frames before its first one from which a segment is registered, starting from the skinned template. In the last
+    two thirds of them the segment before fades into it."""
+    seam_mm: NonNegative = 0.5
+    """What that may add to a frame's motion, mean over the vertices; a segment that is farther from the one before is
+    registered anew from that one's end, once it is done."""
     start: Literal["best", "previous", "skinned"] = "best"
     """Start of a frame: the frame before, as it lies and moved with the body; the skinned pose; or a blend of them by
     how near each is to the scan."""

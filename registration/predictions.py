@@ -29,7 +29,7 @@ from registration.regions import find_regions
 from registration.register import FrameScan
 from registration.template import TemplateAnalysis
 
-__all__ = ["Mover", "bend_deg", "blend", "choose", "misfit", "predict"]
+__all__ = ["Mover", "blend", "choose", "misfit", "predict"]
 
 
 BLEND_FLOOR, BLEND_REACH = 0.002, 0.1
@@ -79,15 +79,6 @@ class Mover:
         offset = np.where(flagged[:, None], 0.0, rest - self.rest)
         transforms = pose_frame(self.shaped, self.poses, index).transforms
         return skin(self.rest + offset, self.skin_weights, transforms)
-
-
-def bend_deg(skin_weights: Float32[np.ndarray, "verts joints"], poses: PoseSequence) -> Float64[np.ndarray, " frames"]:
-    """How far each frame's joints are from the rest pose: root mean square angle under the garment, degrees."""
-    share = skin_weights.sum(axis=0).astype(np.float64)
-    share[0] = 0.0  # the root moves everything alike
-    trace = np.einsum("tjaa->tj", poses.rotations.astype(np.float64))
-    angle = np.degrees(np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0)))
-    return np.sqrt((share * angle**2).sum(axis=1) / max(float(share.sum()), 1e-12))
 
 
 def predict(

@@ -1,9 +1,8 @@
-"""A take, frame after frame: where each frame starts from, and what happens when one fails.
+"""Frames one after the other: where each starts from, and what happens when one fails.
 
 Frame by frame the cloth moves little and what it slides along the body can be followed; over larger steps it cannot. So
-frames are registered one from the other, in segments. A segment starts from a keyframe: a frame whose pose is so near
-the template's rest pose that the skinned template is a start as good as any (with the cold schedule). Segments need
-nothing from each other, run in parallel, and give the same result on any number of workers.
+frames are registered one from the other. The first starts from the skinned template (with the cold schedule), or from
+the last frame of another run.
 """
 
 from __future__ import annotations
@@ -11,20 +10,19 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32
 
 from capture4d.errors import InputError
 from capture4d.types import GarmentScan
-from registration.config import RegistrationConfig, SequenceConfig
+from registration.config import RegistrationConfig
 from registration.predictions import Mover, choose, predict
 from registration.quality import FrameQuality, assess
 from registration.register import prepare_frame, register_frame
 from registration.template import TemplateAnalysis, UnknownBorderError
 
-__all__ = ["FrameResult", "register_run", "segments"]
+__all__ = ["FrameResult", "register_run"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,30 +40,7 @@ class FrameResult:
     position: int
     """In the take."""
     before: int | None
-    """Position of the frame that it could start from; None of the first of a segment."""
-
-
-def segments(bend: Float64[np.ndarray, " frames"] | None, frames: int, config: SequenceConfig) -> list[range]:
-    """The take cut at its keyframes, as positions; every segment begins with one.
-
-    A keyframe is the frame nearest to the rest pose among its neighbours, near enough for the skinned template, and at
-    least `config.segment` frames after the one before. Without poses there is one segment.
-
-    Args:
-        bend: how far each frame's joints are from the rest pose, as `bend_deg` has it; None without poses.
-    """
-    starts = [0]
-    if bend is not None:
-        reach = max(config.segment // 4, 1)
-        for position in range(1, frames):
-            around = bend[max(position - reach, 0) : position + reach + 1]
-            if (
-                position - starts[-1] >= config.segment
-                and frames - position >= config.segment // 2
-                and bend[position] <= min(config.keyframe_bend_deg, float(around.min()))
-            ):
-                starts.append(position)
-    return [range(start, end) for start, end in pairwise([*starts, frames])]
+    """Position of the frame that it could start from; None of the first of a run."""
 
 
 def register_run(
@@ -77,6 +52,7 @@ def register_run(
     load: Callable[[int], GarmentScan],
     done: Callable[[int, int | None], tuple[np.ndarray, bool] | None],
     config: RegistrationConfig,
+    before: tuple[np.ndarray, int] | None = None,
 ) -> Iterator[FrameResult]:
     """Register frames one from the other; yields those that were not done before.
 
@@ -85,11 +61,11 @@ def register_run(
         frame_ids: of the whole take.
         load: the garment scan of a frame; may raise InputError, which flags the frame.
         done: of the frame at a position, if it was finished earlier, starting from the frame at another (None for the
-            first of a segment): its vertices, and whether they may be built upon; else None.
+            first of a run): its vertices, and whether they may be built upon; else None.
+        before: vertices to start from, and the position of their frame; None starts from the template.
     Raises:
         UnknownBorderError: paints are named after loops that the template lacks.
     """
-    before: tuple[np.ndarray, int] | None = None
     for position in positions:
         frame_id = frame_ids[position]
         earlier = done(position, None if before is None else before[1])

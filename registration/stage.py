@@ -5,19 +5,19 @@ garment.npz               the template
 frames/000123.npz         vertices (V, 3) float32, verdict (0 good, 1 check, 2 failed), and per vertex (V,) residual_m,
                           border_error_m, stretch float32 and flipped bool, as in `FrameQuality`
 metrics/000123.json       the frame's numbers, reasons and CPU time
+tails/, leads/, seams/    where segments overlap: what both made of a frame, and how they go together (`chain`)
 vertices.npy              (T, V, 3) float32, all frames
 metrics.jsonl             the frames' metrics, one per line
 
 A frame is made from the garment of its scan, the template, the body and its pose, and from the frame that it starts
 from, with that frame's pose. What is changed in a frame goes on to the frames after it in its segment, as far as they
-come out otherwise.
+come out otherwise; and into the next as far as that overlaps.
 """
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import asdict, dataclass
-from functools import partial
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -25,10 +25,9 @@ import numpy as np
 from capture4d.body.binding import with_body_shape
 from capture4d.body.sewing_pattern import with_known_pattern
 from capture4d.captures.capture import Capture
-from capture4d.captures.garment_scans import load_garment_scan
+from capture4d.captures.segments import cut
 from capture4d.captures.work_folder import (
     REGISTER,
-    VERDICTS,
     load_records,
     load_tracking,
     require_from_scans,
@@ -36,24 +35,23 @@ from capture4d.captures.work_folder import (
     tracking_digest,
 )
 from capture4d.errors import InputError
-from capture4d.files.arrays import ArrayFile
-from capture4d.files.atomic import nan_to_none, read_json, write_json, write_json_lines, write_npz
+from capture4d.files.atomic import read_json, write_json_lines
 from capture4d.files.records import save_garment
 from capture4d.runs.changes import StageChanges
 from capture4d.runs.frame_lists import frame_file
 from capture4d.runs.growing import GrowingStage, Pending, Reads, open_growing_stage, stage_changes
-from capture4d.runs.made import Ledger, digest_of, noted
-from capture4d.runs.stage import Stage, StageResult
-from capture4d.runs.workers import run_jobs, shared
+from capture4d.runs.made import Ledger, digest_of
+from capture4d.runs.stage import StageResult
 from capture4d.types import Body, Garment, PoseSequence
+from registration.chain import Chain
 from registration.config import RegistrationConfig
-from registration.predictions import Mover, bend_deg
-from registration.sequence import FrameResult, register_run, segments
-from registration.template import TemplateAnalysis, analyse_template
+from registration.predictions import Mover
+from registration.take import Take, register_take
+from registration.template import analyse_template
 
 __all__ = ["changes", "run"]
 
-SCHEMA = 4
+SCHEMA = 5
 
 
 def run(
@@ -93,17 +91,10 @@ def run(
     path = output / "garment.npz"
     stage.make_unless_standing(path, lambda: save_garment(path, garment), inputs={"garment": _garment_digest(garment)})
     chain = _chain(capture, stage.ledger, garments, config, (garment, moving), body_folder)
-    jobs = [each for each in chain.segments if chain.first_stale(each) is not None]
-    if jobs:
+    if chain.todo().is_any:
         analysis = analyse_template(garment, config)
         mover = None if moving is None else Mover.create(analysis, *moving)
-        take = _Take(analysis, mover, config, garment_folder, stage, chain)
-        for _ in run_jobs(
-            _register_segment, jobs, prepare=shared(take), workers=workers, label="register", units=len,
-            finished=partial(noted, output),
-        ):  # fmt: skip
-            pass
-        stage = stage.with_notes()
+        stage = register_take(Take(analysis, mover, config, garment_folder, stage, chain), workers)
     paths = [stage.frame_path(frame_id) for frame_id in capture.frame_ids]
     _gather(stage, capture.frame_ids, stage.digest_of_all(paths))
     return stage.finish_growing(
@@ -133,16 +124,12 @@ def changes(
             return Pending(capture.frame_ids)
         moving = _moving(capture, body_folder)
         chain = _chain(capture, ledger, garments, config, (_shaped(capture, moving), moving), body_folder)
-        certain, following = set[int](), set[int]()
-        for positions in chain.segments:
-            first = chain.first_stale(positions)
-            if first is not None:
-                certain.add(first)
-                following.update(position for position in positions if position > first)
-        missing = {at for at, each in enumerate(capture.frame_ids) if ledger.of(chain.path(each)) is None}
-        certain |= following & missing
-        ids = capture.frame_ids
-        return Pending(tuple(ids[at] for at in sorted(certain)), tuple(ids[at] for at in sorted(following - certain)))
+        todo, ids = chain.todo(), capture.frame_ids
+        missing = {at for at in range(len(ids)) if ledger.of(chain.file(at)) is None}
+        certain = {*todo.certain} | ({*todo.following} & missing)
+        return Pending(
+            tuple(ids[at] for at in sorted(certain)), tuple(ids[at] for at in todo.following if at not in certain)
+        )
 
     return stage_changes(
         output, name=REGISTER, schema=SCHEMA, config=config, reads=_reads(capture, {}, body_folder), pending=pending
@@ -179,50 +166,6 @@ def _shaped(capture: Capture, moving: tuple[Body, PoseSequence] | None) -> Garme
 # --- what a frame is made from -----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Chain:
-    """What each frame would be made from, by position in the take."""
-
-    ledger: Ledger
-    frame_ids: tuple[int, ...]
-    settings: str
-    """Digest of what all frames share: settings, template, body."""
-    garments: tuple[str, ...]
-    """Digest of the garment of each frame's scan."""
-    poses: tuple[str, ...]
-    """Of each frame's pose; empty without poses."""
-    segments: tuple[range, ...]
-    """The take cut at its keyframes."""
-    reads_before: bool
-    """Whether a frame starts from the one before; else it matters only that there is one."""
-
-    def path(self, frame_id: int) -> Path:
-        return frame_file(self.ledger.folder, frame_id)
-
-    def inputs(self, position: int, before: int | None) -> dict[str, str]:
-        """What the frame at a position is made from, if it can start from the one at another."""
-        found = {"settings": self.settings, "garment": self.garments[position], "pose": self.poses[position]}
-        if before is None or not self.reads_before:
-            return {**found, "start": "distant" if before is None else "near"}
-        made = self.ledger.of(self.path(self.frame_ids[before]))
-        assert made is not None
-        return {**found, "start": f"{made.digest} {self.poses[before]}"}
-
-    def stands(self, position: int, before: int | None) -> bool:
-        return self.ledger.stands(self.path(self.frame_ids[position]), self.inputs(position, before))
-
-    def first_stale(self, positions: range) -> int | None:
-        """The first frame of a segment that is to be registered, None if all stand."""
-        before = None
-        for position in positions:
-            if not self.stands(position, before):
-                return position
-            made = self.ledger.of(self.path(self.frame_ids[position]))
-            assert made is not None
-            before = position if made.said["sound"] else before
-        return None
-
-
 def _chain(
     capture: Capture,
     ledger: Ledger,
@@ -230,10 +173,10 @@ def _chain(
     config: RegistrationConfig,
     template: tuple[Garment, tuple[Body, PoseSequence] | None],
     body_folder: Path | None,
-) -> _Chain:
+) -> Chain:
     garment, moving = template
     frame_ids, body, poses = capture.frame_ids, "", [""] * len(capture.frame_ids)
-    pieces = segments(None, len(frame_ids), config.sequence)
+    sequence, pieces = config.sequence, cut(len(frame_ids), max(len(frame_ids), 1), 0)
     if moving is not None and garment.skin_weights is not None:
         body = capture.body_digest or "built-in"
         if body_folder is not None:
@@ -241,19 +184,20 @@ def _chain(
             body = "" if made is None else made.digest
         body = digest_of([body, moving[1].shape])
         poses = [_array_digest(moving[1].rotations[row], moving[1].translations[row]) for row in range(len(frame_ids))]
-        pieces = segments(bend_deg(garment.skin_weights, moving[1]), len(frame_ids), config.sequence)
+        pieces = cut(len(frame_ids), sequence.segment, 0 if sequence.start == "skinned" else sequence.overlap)
     read = asdict(config)
-    for cut in ("segment", "keyframe_bend_deg"):  # what they decide shows in where frames start from
-        del read["sequence"][cut]
+    for apart in ("segment", "overlap", "seam_mm"):  # what they decide shows in where frames start from
+        del read["sequence"][apart]
     found = [garments.of(frame_file(garments.folder, frame_id)) for frame_id in frame_ids]
-    return _Chain(
+    return Chain(
         ledger,
         frame_ids,
         digest_of([read, _garment_digest(garment), body]),
         tuple("" if each is None else each.digest for each in found),
         tuple(poses),
-        tuple(pieces),
-        config.sequence.start != "skinned",
+        pieces,
+        sequence.seam_mm,
+        sequence.start != "skinned",
     )
 
 
@@ -272,88 +216,12 @@ def _array_digest(*arrays: np.ndarray) -> str:
     return total.hexdigest()
 
 
-# --- frames ------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Take:
-    """What all segments of a take share: the template on the person who moves it, ready to be registered."""
-
-    analysis: TemplateAnalysis
-    mover: Mover | None
-    config: RegistrationConfig
-    garment_folder: Path
-    stage: GrowingStage
-    chain: _Chain
-
-
-def _register_segment(take: _Take, positions: range) -> int:
-    """Register and write the frames of a segment that do not stand; how many they were."""
-    chain = take.chain
-
-    def done(position: int, before: int | None) -> tuple[np.ndarray, bool] | None:
-        if not chain.stands(position, before):
-            return None
-        with ArrayFile(chain.path(chain.frame_ids[position])) as arrays:
-            return arrays["vertices"], VERDICTS[int(arrays["verdict"])] != "failed"
-
-    results = register_run(
-        take.analysis,
-        take.mover,
-        positions,
-        chain.frame_ids,
-        load=lambda frame_id: load_garment_scan(take.garment_folder / "frames" / f"{frame_id:06d}.npz", frame_id),
-        done=done,
-        config=take.config,
-    )
-    count = 0
-    for result in results:
-        _make_frame(take, result)
-        count += 1
-    return count
-
-
-def _make_frame(take: _Take, result: FrameResult) -> None:
-    stage = take.stage
-    stage.make(
-        stage.frame_path(result.frame_id),
-        lambda: _write_frame(stage, result),
-        inputs=take.chain.inputs(result.position, result.before),
-        said={"sound": result.quality.verdict != "failed"},
-    )
-
-
-def _write_frame(stage: Stage, result: FrameResult) -> None:
-    """Metrics first: the frame counts as done once its npz is there."""
-    numbers = nan_to_none(result.quality.numbers)
-    write_json(
-        _metrics_path(stage, result.frame_id),
-        {
-            "frame_id": result.frame_id,
-            "verdict": result.quality.verdict,
-            "reasons": list(result.quality.reasons),
-            **numbers,
-            "regions": {name: nan_to_none(measures) for name, measures in result.quality.regions.items()},
-            "cpu_s": round(result.cpu_s, 4),
-            "started_from": result.started_from,
-            "iterations": result.linear_iterations,
-        },
-    )
-    write_npz(
-        stage.frame_path(result.frame_id),
-        vertices=result.vertices,
-        **result.quality.vertex_arrays(),
-        verdict=np.uint8(VERDICTS.index(result.quality.verdict)),
-    )
-
-
-def _metrics_path(stage: Stage, frame_id: int) -> Path:
-    return stage.frame_path(frame_id, ".json", folder="metrics")
+# --- the take --------------------------------------------------------------------------------------------------------
 
 
 def _gather(stage: GrowingStage, frame_ids: tuple[int, ...], digest: str) -> None:
     """Stack the frames and their metrics, unless these are stacked."""
     vertices, metrics = stage.path / "vertices.npy", stage.path / "metrics.jsonl"
-    records = (read_json(_metrics_path(stage, frame_id)) for frame_id in frame_ids)
+    records = (read_json(stage.frame_path(frame_id, ".json", folder="metrics")) for frame_id in frame_ids)
     stage.make_unless_standing(vertices, lambda: stack_vertices(stage, frame_ids), inputs={"frames": digest})
     stage.make_unless_standing(metrics, lambda: write_json_lines(metrics, records), inputs={"frames": digest})

@@ -9,14 +9,14 @@ from itertools import groupby
 from typing import Any
 
 from capture4d.cli.option_tree import Option, summary_of
-from capture4d.cli.options import GradedOptions, MeshOptions, ProgressOptions, StageOptions
+from capture4d.cli.options import ClusterOptions, GradedOptions, MeshOptions, ProgressOptions, StageOptions
 
 __all__ = ["EXAMPLES", "command_help", "filled", "overview"]
 
 _WIDEST, _NARROWEST = 100, 40
 _COLUMN = 26
 """Where the sentence about an option begins, counted from the margin."""
-_SHARED = (StageOptions, GradedOptions, ProgressOptions, MeshOptions, object)
+_SHARED = (StageOptions, ClusterOptions, GradedOptions, ProgressOptions, MeshOptions, object)
 """Whose options many commands have, in the order in which they are listed; help is nobody's."""
 _GROUPS: Mapping[str, Sequence[str]] = {
     "from scans to a registered garment:": (
@@ -44,7 +44,11 @@ EXAMPLES: Mapping[str, Sequence[str]] = {
     "extract": ("extract capture --output work",),
     "track": ("track capture --output work",),
     "register": ("register capture --output work", "register capture --output work --tracked --preset paper"),
-    "run": ("run capture --output work", "run capture --output work --workers 8 --max-failed 2 --quiet"),
+    "run": (
+        "run capture --output work",
+        "run capture --output work --workers 8 --max-failed 2 --quiet",
+        "run capture --output work --scheduler tcp://head:8786",
+    ),
     "report": ("report work", "report work --fail-above fit_mean_mm=1.0 --fail-above frames_failed=0"),
     "status": ("status work", "status work --json"),
     "diff": ("diff before after", "diff before after --fail-if-worse fit_mean_mm=5"),

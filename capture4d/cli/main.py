@@ -152,7 +152,7 @@ def _dispatch(arguments: list[str]) -> int:
     if getattr(command, "dry_run", False):  # nothing is written: no lock, no log, not even a folder
         with _showing(command), _allowing(command):
             return command()
-    with _showing(command), _allowing(command), _alone(command):
+    with _showing(command), _allowing(command), _alone(command), _spreading(command):
         return _logged(command, arguments)
 
 
@@ -185,6 +185,19 @@ def _showing(command: Any) -> Iterator[None]:
     from capture4d.runs.progress import progress_style
 
     with progress_style(command.style):
+        yield
+
+
+@contextlib.contextmanager
+def _spreading(command: Any) -> Iterator[None]:
+    """A cluster does the work, if there is to be one."""
+    address = getattr(command, "scheduler", None)
+    if address is None:
+        yield
+        return
+    from capture4d.runs.cluster.scheduler import use_scheduler
+
+    with use_scheduler(address):
         yield
 
 

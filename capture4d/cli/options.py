@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from capture4d.runs.stage import StageResult
 
 __all__ = [
+    "ClusterOptions",
     "DecidingOptions",
     "GradedOptions",
     "MeshOptions",
@@ -63,7 +64,16 @@ class ProgressOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class StageOptions(ProgressOptions):
+class ClusterOptions:
+    """Of commands that can be done by several processes."""
+
+    scheduler: str | None = None
+    """Let the workers of a Dask scheduler do the work, in place of processes here: its address, such as
+    tcp://HOST:8786. The result does not depend on it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageOptions(ProgressOptions, ClusterOptions):
     """Of stages: how they are run."""
 
     workers: Count = field(default_factory=all_cores)

@@ -40,6 +40,7 @@ from capture4d.errors import InputError
 from capture4d.extraction.garment import ColourNotFoundError, cut_out
 from capture4d.files.atomic import write_json, write_npz
 from capture4d.runs.changes import StageChanges, say
+from capture4d.runs.cluster.attempts import begin_frame, end_frame
 from capture4d.runs.frame_lists import counted, frame_file, listed
 from capture4d.runs.growing import GrowingStage, Pending, Reads, open_growing_stage, stage_changes
 from capture4d.runs.made import Ledger, digest_of, make
@@ -243,6 +244,7 @@ def write_frame(take: _Extraction, frame_id: int, *, keep_faults: bool = True) -
     fault, found, estimated = None, None, False
     with scan_looked_at(take.capture, frame_id) as looked:
         try:
+            begin_frame(path)
             found, estimated = extract_frame(take.capture, take.colours, frame_id)
         except InputError as error:
             fault = error
@@ -260,4 +262,5 @@ def write_frame(take: _Extraction, frame_id: int, *, keep_faults: bool = True) -
 
     inputs = {**take.inputs, "scan": scan_digest(looked)}
     make(take.folder, path, write, inputs=inputs, files=looked, said=said)
+    end_frame(path)
     return fault

@@ -95,8 +95,8 @@ class GrowingStage(Stage):
         return known if known is not None and self.stands(path, inputs) else self.make(path, write, inputs=inputs)
 
     def with_notes(self) -> GrowingStage:
-        """The same, knowing what other processes have made since."""
-        return replace(self, ledger=Ledger.read(self.path))
+        """The same, knowing what other processes have made since; they may make the same files again now."""
+        return replace(self, ledger=Ledger.open(self.path))
 
     def digest_of_all(self, paths: Iterable[Path]) -> str:
         """Digest over the names and contents of files that were all made."""

@@ -1,4 +1,5 @@
-"""A pool of local workers that tell how far they are: one thread each, and none outlives the command."""
+"""A pool of workers that tell how far they are: one thread each, and none outlives the command. They are processes of
+this machine, or those of a cluster (`runs.cluster`)."""
 
 from __future__ import annotations
 
@@ -14,6 +15,7 @@ from functools import partial
 from multiprocessing.connection import wait
 from typing import Any, TypeVar, overload
 
+from capture4d.runs.cluster.scheduler import Cluster, chosen_cluster
 from capture4d.runs.progress import progress
 
 __all__ = ["WorkerDied", "run_jobs", "shared"]
@@ -74,16 +76,22 @@ def run_jobs(
         prepare: makes what all jobs need, once in each process, before its first job: `function(prepared, job)`. A
             function of a module, or a `functools.partial` of one, with what it needs.
         workers: processes; 1 runs the jobs here, in order. Each worker computes on one thread, so that results do not
-            depend on how many there are.
+            depend on how many there are. With a cluster it has no meaning.
         units: how much of the progress a job is worth, 1 each if None.
         finished: units done so far, read from disk once a second; for jobs that are worth many.
     Raises:
-        WorkerDied: a worker was killed.
+        WorkerDied: a worker was killed; of a cluster, every one that did the same job.
+        InputError: there is no cluster where one was chosen, or its workers are not fit.
     """
     if not jobs:
         return
-    total = sum(units(job) if units else 1 for job in jobs)
+    total, cluster = sum(units(job) if units else 1 for job in jobs), chosen_cluster()
     with progress(label, total, finished) as advance:
+        if cluster is not None:
+            for at, result in _on_cluster(cluster, function, jobs, prepare, label):
+                advance(units(jobs[at]) if units else 1)
+                yield result
+            return
         if workers <= 1 or len(jobs) <= 1:
             given = () if prepare is None else (prepare(),)
             for job in jobs:
@@ -117,6 +125,21 @@ def run_jobs(
             raise
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _on_cluster(
+    cluster: Cluster,
+    function: Callable[..., Result],
+    jobs: Sequence[Any],
+    prepare: Callable[[], Any] | None,
+    label: str,
+) -> Iterator[tuple[int, Result]]:
+    from capture4d.runs.cluster.jobs import ClusterLostError, cluster_jobs
+
+    try:
+        yield from cluster_jobs(cluster, function, jobs, prepare)
+    except ClusterLostError as error:
+        raise WorkerDied(f"{label}: {error}; finished frames are kept, the same command goes on") from None
 
 
 @contextlib.contextmanager

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import field
 
-from capture4d.settings import Cosine, Count, NonNegative, Positive, Share, settings
+from capture4d.settings import Cosine, Count, NonNegative, Positive, Share, Whole, settings
 
 __all__ = ["ColdStartConfig", "FitConfig", "SamplingConfig", "Schedule", "SequenceConfig", "TrackingConfig"]
 
@@ -90,6 +90,13 @@ class ColdStartConfig:
 class SequenceConfig:
     """From frame to frame."""
 
+    segment: Count = 240
+    """Frames of a segment. Segments are followed side by side, on as many processes and machines as there are."""
+    overlap: Whole = 24
+    """Frames before its first one from which a segment is followed, beginning with a search."""
+    seam_mm: NonNegative = 10.0
+    """How far a segment may put a frame from where the one before has it, mean over the joints; if it is farther, it is
+    followed anew from that one's end."""
     follow: Schedule = Schedule(iterations=4, first_scale_m=0.05, last_scale_m=0.015)
     """Of a frame that starts from the one before."""
     retry: Schedule = Schedule(iterations=15, first_scale_m=0.12, last_scale_m=0.015)

@@ -11,13 +11,14 @@ import numpy as np
 
 from capture4d.captures.scan_states import DAMAGED, scan_digest, stands_with_scan
 from capture4d.files.atomic import nan_to_none, read_json, write_json, write_npz
+from capture4d.runs.cluster.attempts import end_frame
 from capture4d.runs.growing import GrowingStage
 from capture4d.runs.made import digest_of, make
 from capture4d.tracking.limbs import unseen_limbs
 from capture4d.tracking.sequence import Followed, Refined, Tracker, between
 from capture4d.tracking.take import TakeShape, TrackedTake, followed_frame, load_followed, numbers_of
 
-__all__ = ["RefineJob", "prepare_refining", "refine_frame", "refine_jobs"]
+__all__ = ["RefineJob", "refine_frame", "refine_jobs"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,10 +67,6 @@ def _surroundings(take: TrackedTake) -> list[tuple[int, ...]]:
     return around
 
 
-def prepare_refining(take: TrackedTake) -> tuple[TrackedTake, Tracker]:
-    return take, take.tracker()
-
-
 def refine_frame(prepared: tuple[TrackedTake, Tracker], job: RefineJob) -> None:
     take, tracker = prepared
     capture, stage = take.capture, take.stage
@@ -81,7 +78,8 @@ def refine_frame(prepared: tuple[TrackedTake, Tracker], job: RefineJob) -> None:
         share = (job.frame_id - job.around[0]) / (job.around[-1] - job.around[0]) if len(near) == 2 else 0.0
         start = between(near[0], near[1], share) if len(near) == 2 else near[0]
     start = replace(start, shape=np.array(job.shape))
-    points, fault, looked = take.points(job.frame_id)
+    path = stage.frame_path(job.frame_id, folder="refined")
+    points, fault, looked = take.points(job.frame_id, path)
     around = [] if job.lost else near
     refined = tracker.refine(points, start, around, interval_s=1 / capture.fps, lost=first.quality.lost)
     if fault:
@@ -90,12 +88,13 @@ def refine_frame(prepared: tuple[TrackedTake, Tracker], job: RefineJob) -> None:
     cpu_s = time.process_time() - begin
     make(
         stage.path,
-        stage.frame_path(job.frame_id, folder="refined"),
+        path,
         lambda: _save_refined(stage, job.frame_id, first, refined, unseen, cpu_s),
         inputs={**job.inputs, "scan": scan_digest(looked)},
         files=looked,
         said={DAMAGED: True} if fault else {},
     )
+    end_frame(path)
 
 
 def _save_refined(

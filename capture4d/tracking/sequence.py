@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float64
 from scipy.spatial.transform import Rotation
 
 from capture4d.body.posed_surface import BodyState, TrackedBody, match, pose_surface, tracked_body
+from capture4d.body.skinning import with_pose, with_shape
 from capture4d.tracking.cold_start import find_pose
 from capture4d.tracking.config import Schedule, SequenceConfig, TrackingConfig
 from capture4d.tracking.fit import Expectation, Fit, fit_body
@@ -26,7 +27,18 @@ from capture4d.tracking.joint_prior import JointPrior, joint_prior
 from capture4d.tracking.scan_points import ScanPoints
 from capture4d.types import Body
 
-__all__ = ["NOTHING", "Followed", "Quality", "Refined", "Tracker", "between", "judge", "outlying"]
+__all__ = [
+    "NOTHING",
+    "Followed",
+    "Quality",
+    "Refined",
+    "Tracker",
+    "apart_mm",
+    "between",
+    "joint_shape",
+    "judge",
+    "outlying",
+]
 
 NOTHING = "nothing"
 """Where frames before the first that can be read start from."""
@@ -245,6 +257,32 @@ def outlying(
     """
     usual = float(np.nanmedian(medians_m)) if np.isfinite(medians_m).any() else 0.0
     return usual, medians_m > max(config.outlier_median * usual, config.least_outlier_m)
+
+
+def apart_mm(body: Body, first: BodyState, second: BodyState) -> float:
+    """How far two poses of a frame are from each other, each with its own shape: mean over the joints, millimetres."""
+    places = [
+        with_pose(with_shape(body, state.shape), state.rotations, state.translation).joint_centres()
+        for state in (first, second)
+    ]
+    return 1e3 * float(np.linalg.norm(places[1] - places[0], axis=1).mean())
+
+
+def joint_shape(
+    shapes: Sequence[Float64[np.ndarray, " shapes"]],
+    information: Sequence[Float64[np.ndarray, "shapes shapes"]],
+    prior: float,
+) -> Float64[np.ndarray, " shapes"]:
+    """The shape that several parts of a take say together.
+
+    Args:
+        shapes: the most likely one of each part by itself.
+        information: what each part says of it, the prior left out.
+        prior: inverse variance of a coefficient before any scan.
+    """
+    alone = prior * np.eye(len(shapes[0]))
+    told = sum((known + alone) @ shape for known, shape in zip(information, shapes, strict=True))
+    return np.linalg.solve(sum(information, alone), told)
 
 
 def between(first: BodyState, second: BodyState, share: float) -> BodyState:

@@ -3,6 +3,7 @@
 stage.json               what was run
 body.npz                 the body that was tracked: the capture's, else the built-in one
 frames/000123.npz        first pass, forwards: where the next frame starts from
+leads/, seams/           where segments overlap: the later one's frames, and how far apart they are (`first_pass`)
 shape.json               the shape of the take, which all frames have contributed to, and the frames it had then
 refined/000123.npz       second pass: rotations, translation, seen joints
 metrics/000123.json      verdict (good, check, lost), reasons, limbs that nobody scanned, numbers and CPU time
@@ -10,8 +11,9 @@ poses.npz                the take's poses and shape, as a capture would bring th
 metrics.jsonl            the frames' metrics, one per line
 
 In the first pass a frame is made from its scan and the one or two that it starts from: what is changed there goes
-on to the frames after it, and what is added behind the last begins with it. In the second it is made from its scan,
-itself and its neighbours in the first, and the shape; so the shape, once it is found, stays until it is to be renewed.
+on to the frames after it in its segment, and what is added behind the last begins with it. In the second it is made
+from its scan, itself and its neighbours in the first, and the shape; so the shape, once it is found, stays until it is
+to be renewed.
 """
 
 from __future__ import annotations
@@ -39,16 +41,24 @@ from capture4d.runs.made import Ledger, digest_of
 from capture4d.runs.stage import StageResult
 from capture4d.runs.workers import run_jobs
 from capture4d.tracking.config import SequenceConfig, TrackingConfig
-from capture4d.tracking.first_pass import follow_frames, require_found, standing_frames
+from capture4d.tracking.first_pass import FirstPass, follow_frames, require_found, seams_of
 from capture4d.tracking.limbs import guessed_limbs
-from capture4d.tracking.second_pass import prepare_refining, refine_frame, refine_jobs
+from capture4d.tracking.second_pass import refine_frame, refine_jobs
 from capture4d.tracking.sequence import outlying
-from capture4d.tracking.take import TakeShape, TrackedTake, kept_shape, reads_of, refined_paths, take_shape
+from capture4d.tracking.take import (
+    TakeShape,
+    TrackedTake,
+    kept_shape,
+    prepared_take,
+    reads_of,
+    refined_paths,
+    take_shape,
+)
 from capture4d.types import PoseSequence
 
 __all__ = ["changes", "run"]
 
-SCHEMA = 5
+SCHEMA = 6
 NAME = "track"
 
 
@@ -89,14 +99,15 @@ def run(
     )
     colours = colours_of_take(capture, output)
     take = TrackedTake(capture, stage, config, colours.colours)
-    follow_frames(take)
+    take = follow_frames(take, workers)
+    stage = take.stage
     require_found(take)
     shape = take_shape(take)
     kept = {"shape": shape.frames, "colours": "" if colours.newly else colours.frames}
     jobs = refine_jobs(take, shape)
     if jobs:
         _say_kept(output.name, {what: frames for what, frames in kept.items() if frames}, capture.frame_ids)
-        prepare = partial(prepare_refining, take)
+        prepare = partial(prepared_take, take)
         for _ in run_jobs(refine_frame, jobs, prepare=prepare, workers=workers, label="refine poses"):
             pass
         stage = stage.with_notes()
@@ -136,15 +147,16 @@ def changes(capture: Capture, output: Path, config: TrackingConfig) -> StageChan
 
 def _pending(take: TrackedTake, shape: TakeShape | None) -> Pending:
     """Frames that are to be tracked."""
-    capture, ledger, settings = take.capture, take.stage.ledger, take.settings_digest()
-    frame_ids, stage = capture.frame_ids, take.stage
+    capture, ledger, stage = take.capture, take.stage.ledger, take.stage
+    frame_ids = capture.frame_ids
     replaced = [each for each in frame_ids if replaced_scan(ledger, stage.frame_path(each), capture, each)]
-    _, at = standing_frames(take, settings)
-    if at == len(frame_ids):
+    todo = FirstPass.of(take).todo()
+    if not todo.is_any:
         again = frame_ids if shape is None else tuple(job.frame_id for job in refine_jobs(take, shape))
         return Pending(again, replaced=tuple(replaced))
-    certain = {frame_ids[at], *replaced, *(each for each in frame_ids if ledger.sound(stage.frame_path(each)) is None)}
-    following = tuple(each for each in frame_ids[at:] if each not in certain)
+    missing = (each for each in frame_ids if ledger.sound(stage.frame_path(each)) is None)
+    certain = {*todo.certain, *replaced, *missing}
+    following = tuple(each for each in todo.following if each not in certain)
     return Pending(tuple(sorted(certain)), following, tuple(replaced))
 
 
@@ -182,9 +194,14 @@ def _gather(take: TrackedTake, shape: TakeShape) -> None:
     refined = stage.digest_of_all(refined_paths(take))
     followed = stage.digest_of_all([stage.frame_path(frame_id) for frame_id in capture.frame_ids])
     poses, metrics = stage.path / "poses.npz", stage.path / "metrics.jsonl"
+    seams = seams_of(take)
     shared = {"refined": refined, "settings": digest_of([take.settings_digest(), shape.coefficients, capture.fps])}
     stage.make_unless_standing(poses, lambda: _save_poses(take, shape, poses), inputs=shared)
-    stage.make_unless_standing(metrics, lambda: _save_metrics(take, metrics), inputs={**shared, "followed": followed})
+    stage.make_unless_standing(
+        metrics,
+        lambda: _save_metrics(take, seams, metrics),
+        inputs={**shared, "followed": followed, **({"seams": digest_of([*seams.items()])} if seams else {})},
+    )
 
 
 def _save_poses(take: TrackedTake, shape: TakeShape, path: Path) -> None:
@@ -207,6 +224,19 @@ def _save_poses(take: TrackedTake, shape: TakeShape, path: Path) -> None:
     )
 
 
-def _save_metrics(take: TrackedTake, path: Path) -> None:
+def _save_metrics(take: TrackedTake, seams: Mapping[int, Mapping[str, Any]], path: Path) -> None:
     paths = (take.stage.frame_path(frame_id, ".json", folder="metrics") for frame_id in take.capture.frame_ids)
-    write_json_lines(path, _with_take([read_json(each) for each in paths], take.config.sequence))
+    records = _with_take([read_json(each) for each in paths], take.config.sequence)
+    write_json_lines(path, [_with_seam(each, seams.get(each["frame_id"]), take.config.sequence) for each in records])
+
+
+def _with_seam(record: dict[str, Any], seam: Mapping[str, Any] | None, config: SequenceConfig) -> dict[str, Any]:
+    """A frame's record, flagged where a segment begins that could not be compared with the one before, or differs."""
+    if seam is None:
+        return record
+    apart, reasons = seam["seam_mm"], list(record["reasons"])
+    if not seam["continues"] and (apart is None or apart > config.seam_mm):
+        how = "no frame was found by both" if apart is None else f"they are {apart:.0f} mm apart"
+        reasons.append(f"a segment begins here, and cannot be joined with the one before: {how}")
+    verdict = "check" if reasons and record["verdict"] == "good" else record["verdict"]
+    return {**record, "verdict": verdict, "reasons": reasons, "seam_mm": None if apart is None else round(apart, 3)}

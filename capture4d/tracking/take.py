@@ -11,19 +11,21 @@ import numpy as np
 from capture4d.body.posed_surface import BodyState
 from capture4d.captures.capture import Capture, read_scan, scan_path
 from capture4d.captures.scan_states import scan_looked_at
+from capture4d.captures.segments import Segment, cut
 from capture4d.captures.take_colours import KnownColours, described_colours
 from capture4d.errors import InputError
 from capture4d.files.arrays import ArrayFile
 from capture4d.files.atomic import file_digest, read_json, write_json
 from capture4d.files.reading import reading
 from capture4d.files.records import load_body
+from capture4d.runs.cluster.attempts import begin_frame
 from capture4d.runs.decisions import GIVEN
 from capture4d.runs.frame_lists import listed
 from capture4d.runs.growing import GrowingStage, Reads
 from capture4d.runs.made import FileState, Made, digest_of
 from capture4d.tracking.config import TrackingConfig
 from capture4d.tracking.scan_points import ScanPoints, scan_points
-from capture4d.tracking.sequence import Followed, Quality, Tracker
+from capture4d.tracking.sequence import Followed, Quality, Tracker, joint_shape
 
 __all__ = [
     "STARTS",
@@ -33,6 +35,7 @@ __all__ = [
     "kept_shape",
     "load_followed",
     "numbers_of",
+    "prepared_take",
     "reads_of",
     "refined_paths",
     "take_shape",
@@ -51,6 +54,17 @@ class TrackedTake:
     config: TrackingConfig
     colours: KnownColours
 
+    @property
+    def segments(self) -> tuple[Segment, ...]:
+        sequence = self.config.sequence
+        return cut(len(self.capture.frame_ids), sequence.segment, sequence.overlap)
+
+    def made(self, path: Path) -> Made:
+        """What is known of a file that was made."""
+        made = self.stage.ledger.of(path)
+        assert made is not None, path
+        return made
+
     def tracker(self) -> Tracker:
         return Tracker.create(load_body(self.stage.path / "body.npz"), self.config)
 
@@ -67,13 +81,18 @@ class TrackedTake:
         shared = reads_of(self.capture, self.config).shared
         return digest_of([self.config, self.capture.units, seen, body.digest, shared.get("start")])
 
-    def points(self, frame_id: int) -> tuple[ScanPoints, str, list[FileState]]:
+    def points(self, frame_id: int, path: Path) -> tuple[ScanPoints, str, list[FileState]]:
         """Points of a scan, what is wrong with it, and what was read of it: no points where it cannot be read, which
-        loses the frame."""
+        loses the frame.
+
+        Args:
+            path: of the file that is made from it.
+        """
         fault = ""
         points = ScanPoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, bool))
         with scan_looked_at(self.capture, frame_id) as looked:
             try:
+                begin_frame(path)
                 scan = self.colours.flat(read_scan(self.capture, frame_id))
                 source = str(scan_path(self.capture, frame_id))
                 points = scan_points(scan, self.colours.garment, self.paints, self.config.sampling, source=source)
@@ -97,9 +116,12 @@ def reads_of(capture: Capture, config: TrackingConfig) -> Reads:
 
 def followed_frame(take: TrackedTake, frame_id: int) -> Made:
     """What is known of a frame after the first pass."""
-    made = take.stage.ledger.of(take.stage.frame_path(frame_id))
-    assert made is not None
-    return made
+    return take.made(take.stage.frame_path(frame_id))
+
+
+def prepared_take(take: TrackedTake) -> tuple[TrackedTake, Tracker]:
+    """What the workers of both passes need."""
+    return take, take.tracker()
 
 
 def refined_paths(take: TrackedTake) -> list[Path]:
@@ -147,13 +169,27 @@ def kept_shape(take: TrackedTake) -> TakeShape | None:
 
 
 def take_shape(take: TrackedTake) -> TakeShape:
-    """The shape that an earlier run has found, or that after the last frame, which all have contributed to."""
+    """The shape that an earlier run has found, or that which all frames have contributed to."""
     kept = kept_shape(take)
     if kept is not None:
         return kept
-    frame_ids = take.capture.frame_ids
-    state = load_followed(take.stage.frame_path(frame_ids[-1])).state
-    shape = TakeShape(tuple(float(value) for value in state.shape), listed(frame_ids, most=0))
+    shape = TakeShape(_joint_shape(take), listed(take.capture.frame_ids, most=0))
     found = {"shape": shape.coefficients, "frames": shape.frames, "found_from": take.settings_digest()}
     write_json(take.stage.path / SHAPE, found)
     return shape
+
+
+def _joint_shape(take: TrackedTake) -> tuple[float, ...]:
+    """The shape at the end of a take, or the one that all its segments' ends together say: the mean of theirs, weighted
+    by what each knows."""
+    ids, ends = take.capture.frame_ids, []
+    for segment in take.segments:
+        good = (ids[each] for each in reversed(range(segment.start, segment.stop)))
+        end = next((each for each in good if followed_frame(take, each).said["good"]), None)
+        ends += [] if end is None else [load_followed(take.stage.frame_path(end))]
+    if len(take.segments) == 1 or not ends:
+        state = load_followed(take.stage.frame_path(ids[-1])).state
+        return tuple(float(value) for value in state.shape)
+    memory, prior = take.config.sequence.shape_memory, 1 / take.config.fit.shape_spread**2
+    known = [each.shape_information / memory for each in ends] if memory else [each.shape_information for each in ends]
+    return tuple(float(value) for value in joint_shape([each.state.shape for each in ends], known, prior))

@@ -44,6 +44,7 @@ METRICS: Mapping[str, tuple[str, str, str]] = {
     "flipped_faces": ("", "lower", "faces against the scan they lie on, per frame"),
     "self_intersections": ("", "lower", "faces that cut another, per frame"),
     "creased_percent": ("%", "lower", "edges folded by more than 60 degrees, though not at rest"),
+    "seam_mm": ("mm", "lower", "what joining two segments adds to a frame's motion, worst frame"),
     "frames_good_percent": ("%", "higher", "frames with the verdict good"),
     "frames_check": ("", "lower", "frames with the verdict check"),
     "frames_failed": ("", "lower", "frames with the verdict failed"),
@@ -95,6 +96,9 @@ def summarise(records: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
     stretch = column(records, "stretch_p99")
     if np.isfinite(stretch).any():
         special["stretch_p99_worst"] = float(np.nanmax(stretch))
+    seams = column([record for record in records if "seam_mm" in record], "seam_mm")
+    if len(seams):
+        special["seam_mm"] = float(seams.max())
     summary: dict[str, float | None] = {}
     correspondence = column(records, "correspondence_mean_mm")
     measured = np.flatnonzero(np.isfinite(correspondence))

@@ -35,8 +35,8 @@ BEGINNING_S = {"track": 15.0}
 """CPU seconds of what is done once: the first frame's search for the pose."""
 REPORT_S = 40.0
 """CPU seconds of a report, whose pictures are as many for every take."""
-SEGMENT = 240
-"""Frames that are registered one after the other, at least; other segments may run beside them."""
+SEGMENTS = {"track": 240, "register": 120}
+"""Frames that are done one after the other; other segments of the take may be done beside them."""
 GARMENT_SHARE = 0.7
 """Bytes of an extracted garment over those of its scan, of the demo."""
 BODY_BYTES, VERTEX_BYTES, RECORD_BYTES = 120_000, 40, 1_500
@@ -176,7 +176,8 @@ def _planned(
     frame_s, is_guess = _frame_s(folder, changes.name, costs)
     begins = to_do == changes.frames
     once = BEGINNING_S.get(changes.name, 0.0) if begins else 0.0
-    segments = max(1, (to_do + perhaps) // SEGMENT) if changes.name == "register" else changes.frames
+    length = SEGMENTS.get(changes.name)
+    side_by_side = changes.frames if length is None else max(1, (to_do + perhaps + length // 2) // length)
     there = min(changes.frames, _count(folder / "frames"))
     state: Literal["do", "go on", "renew", "nothing", "refuse"]
     if changes.settings and not is_anew:
@@ -200,7 +201,7 @@ def _planned(
         is_guess,
         once + frame_s * to_do if to_do else 0.0,
         once + frame_s * (to_do + perhaps) if to_do or perhaps else 0.0,
-        1 if changes.name == "track" else segments,
+        side_by_side,
         _more_bytes(capture, folder, changes.name, changes.frames - there),
     )
     return _refusing(planned) if state == "refuse" else planned

@@ -11,7 +11,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from capture4d.calibration.config import CalibrationConfig, RigCheckConfig
 from capture4d.cli.exit_codes import BAD_RESULT, GOOD
-from capture4d.cli.options import MeshOptions, ProgressOptions, all_cores
+from capture4d.cli.options import ClusterOptions, MeshOptions, ProgressOptions, all_cores
 from capture4d.errors import InputError
 from capture4d.settings import Count, Positive
 
@@ -19,7 +19,7 @@ __all__ = ["Calibrate", "Check", "CheckRig"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Check(ProgressOptions, MeshOptions):
+class Check(ProgressOptions, ClusterOptions, MeshOptions):
     """Look through a take before a night is spent on it; exit code 3 if it has errors."""
 
     capture: Annotated[Positional[Path], arg(metavar="CAPTURE")]
@@ -93,7 +93,7 @@ class Check(ProgressOptions, MeshOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Calibrate(ProgressOptions):
+class Calibrate(ProgressOptions, ClusterOptions):
     """Calibrate a camera rig from images of a ChArUco board or a checkerboard, with a report of how good it is."""
 
     images: Annotated[Positional[Path], arg(metavar="IMAGES")]
@@ -133,7 +133,7 @@ class Calibrate(ProgressOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CheckRig(ProgressOptions):
+class CheckRig(ProgressOptions, ClusterOptions):
     """Tell which cameras have moved since calibration, from one pose of the board; exit code 3 if one has."""
 
     rig: Annotated[Positional[Path], arg(metavar="RIG")]

@@ -1,4 +1,4 @@
-"""Predictions, segments, failures and resuming, on a tube around one bending bone."""
+"""Predictions, failures and resuming, on a tube around one bending bone."""
 
 from dataclasses import replace
 
@@ -9,10 +9,9 @@ from scipy.spatial.transform import Rotation
 from capture4d.body.skinning import pose_frame, skin
 from capture4d.errors import InputError
 from capture4d.types import Body, Garment, Mesh, PoseSequence
-from registration.config import SequenceConfig
-from registration.predictions import Mover, bend_deg, blend, choose, misfit, predict
+from registration.predictions import Mover, blend, choose, misfit, predict
 from registration.register import prepare_frame
-from registration.sequence import register_run, segments
+from registration.sequence import register_run
 from registration.template import analyse_template
 
 FRAMES = 6
@@ -91,22 +90,6 @@ def test_joints_must_agree(bound, body, poses, config) -> None:
         Mover.create(analyse_template(bound, config), body, replace(poses, joint_names=("root", "other")))
 
 
-def test_without_poses_there_is_one_segment(bound, body, poses, config) -> None:
-    assert segments(None, 500, SequenceConfig(segment=10)) == [range(500)]
-    assert segments(bend_deg(bound.skin_weights, poses), FRAMES, SequenceConfig(segment=100)) == [range(FRAMES)]
-
-
-def test_segments_start_near_the_rest_pose(bound, body, poses, config) -> None:
-    there_and_back = [*range(FRAMES), *reversed(range(FRAMES))] * 2
-    long = replace(
-        poses, rotations=poses.rotations[there_and_back], translations=np.zeros((4 * FRAMES, 3), np.float32),
-        frame_ids=np.arange(4 * FRAMES, dtype=np.int32),
-    )  # fmt: skip
-    cut = segments(bend_deg(bound.skin_weights, long), 4 * FRAMES, SequenceConfig(segment=8, keyframe_bend_deg=1.0))
-    assert [part.start for part in cut] == [0, 2 * FRAMES - 1]
-    assert cut[-1].stop == 4 * FRAMES
-
-
 def test_frames_follow_the_scan_and_start_from_the_best(bound, body, poses, config, load) -> None:
     analysis = analyse_template(bound, config)
     mover = Mover.create(analysis, body, poses)
@@ -144,6 +127,18 @@ def test_resuming_gives_the_same_bits(bound, body, poses, config, load) -> None:
     rest = go(analysis, mover, read, config, done=lambda *at: earlier.get(at))
     assert [result.frame_id for result in rest] == [30, 40, 50]
     for first, second in zip(whole[3:], rest, strict=True):
+        np.testing.assert_array_equal(first.vertices, second.vertices)
+
+
+def test_a_run_goes_on_from_the_end_of_another(bound, body, poses, config, load) -> None:
+    analysis = analyse_template(bound, config)
+    mover, read, frame_ids = Mover.create(analysis, body, poses), load(analysis), tuple(range(0, 10 * FRAMES, 10))
+    whole = go(analysis, mover, read, config)
+    rest = register_run(
+        analysis, mover, range(4, FRAMES), frame_ids, load=read, done=lambda *at: None, config=config,
+        before=(whole[3].vertices, 3),
+    )  # fmt: skip
+    for first, second in zip(whole[4:], rest, strict=True):
         np.testing.assert_array_equal(first.vertices, second.vertices)
 
 

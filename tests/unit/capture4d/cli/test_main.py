@@ -169,6 +169,15 @@ def damaged(path: Path) -> dict[str, bytes]:
     }
 
 
+def test_a_scheduler_that_is_not_there(
+    tube_capture: Path, work: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("capture4d.runs.cluster.jobs.CONNECT_S", 0.3)
+    said = fails(capsys, *extract(tube_capture, work), "--scheduler", "tcp://127.0.0.1:9")
+    assert "--scheduler: expected a scheduler such as tcp://HOST:8786, found none at tcp://127.0.0.1:9" in said
+
+
 def test_a_damaged_scan_is_flagged_and_the_take_goes_on(
     tube_capture: Path, work: Path, capsys: pytest.CaptureFixture[str]
 ):

@@ -16,7 +16,7 @@ from capture4d.tracking.config import FitConfig, Schedule, SequenceConfig, Track
 from capture4d.tracking.fit import fit_body
 from capture4d.tracking.joint_prior import inverse_left_jacobian, joint_prior, limit_terms, pull_terms
 from capture4d.tracking.scan_points import ScanPoints
-from capture4d.tracking.sequence import Tracker, between, judge, outlying
+from capture4d.tracking.sequence import Tracker, apart_mm, between, joint_shape, judge, outlying
 from capture4d.types import Body, Mesh
 
 
@@ -302,3 +302,25 @@ def test_unknown_shape_information_is_symmetric_and_positive(stick: Body) -> Non
     information = fit.shape_information()
     np.testing.assert_allclose(information, information.T, rtol=1e-6)
     assert np.linalg.eigvalsh(information).min() > 1.0, "the prior alone is 1"
+
+
+def test_the_shape_of_a_take_is_that_of_all_its_frames_together() -> None:
+    """As if the segments' equations had been added up: the prior counts once, and what is known better counts more."""
+    rng = np.random.default_rng(0)
+    roots = rng.normal(size=(3, 6, 4))
+    information, sides = np.einsum("nka,nkb->nab", roots, roots), rng.normal(size=(3, 4))
+    prior = 0.7
+    shapes = [np.linalg.solve(each + prior * np.eye(4), side) for each, side in zip(information, sides, strict=True)]
+    whole = np.linalg.solve(information.sum(axis=0) + prior * np.eye(4), sides.sum(axis=0))
+    np.testing.assert_allclose(joint_shape(shapes, list(information), prior), whole, rtol=1e-9)
+    np.testing.assert_allclose(joint_shape(shapes[::-1], list(information[::-1]), prior), whole, rtol=1e-9)
+    np.testing.assert_allclose(joint_shape(shapes[:1], [information[0]], prior), shapes[0], rtol=1e-9)
+    sure = joint_shape([np.ones(4), np.zeros(4)], [1e6 * np.eye(4), np.eye(4)], prior)
+    np.testing.assert_allclose(sure, 1, atol=1e-4)
+
+
+def test_poses_that_are_moved_are_that_far_apart(stick: Body) -> None:
+    state = random_state(stick, np.random.default_rng(1))
+    assert apart_mm(stick, state, state) == 0
+    moved = replace(state, translation=state.translation + np.array([0, 0.003, 0.004]))
+    assert apart_mm(stick, state, moved) == pytest.approx(5)

@@ -1,0 +1,1 @@
+"""Jobs on a Dask cluster, behind `run_jobs`."""
