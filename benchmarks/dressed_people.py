@@ -24,7 +24,7 @@ from capture4d.cache import user_cache_folder
 from capture4d.geometry.mesh import doubled_area_vectors, face_areas, normalised, unique_edges, vertex_normals
 from capture4d.geometry.mesh_kernels import mean_edge_length
 from capture4d.geometry.ray_casting import closest_points
-from capture4d.heavy_imports import import_open3d
+from capture4d.heavy_imports import import_open3d, njit
 from capture4d.types import Mesh
 from data_synth.motions import random_pose
 from data_synth.scanner.config import FusionConfig, NoiseConfig, RigConfig, ScannerConfig
@@ -33,12 +33,13 @@ from data_synth.scanner.scan import LABEL_GARMENT, Surface, scan_surfaces
 
 __all__ = ["PEOPLE", "PeoplePair", "Person", "make_pair"]
 
-VERSION = 2
+VERSION = 4
 """Of what is kept in the user's cache; raise it when these pairs change."""
 SUBJECTS: tuple[tuple[float, ...], ...] = ((0.0, 0.0), (1.3, -1.2), (-1.2, 1.3), (0.6, 1.8, 0.8), (-0.8, -1.0, -1.0))
 """Shape coefficients: height, girth, a third."""
 TEMPLATE_VERTICES = 10_000
 NOISE_M = 0.001
+LENGTH_SWEEPS = 200
 KNOWN_M = 0.004
 """Template vertices farther from the person's own surface, as in the web of an armpit, are no piece of it."""
 WHOLE_SCAN_VOXEL_M = 0.0048
@@ -119,8 +120,8 @@ def _make(person: Person) -> Mapping[str, np.ndarray]:
     last = random_pose(clothes.shaped, rng)
     _turn_legs(clothes.shaped, last, rng)
     before = clothes.surface(first, 0.0)
-    after = _moved(clothes, first, last, before, person.motion_m)
     faces = clothes.faces
+    after = _lengths_kept(before, _moved(clothes, first, last, before, person.motion_m), faces)
     template = _reconstructed(before, faces, TEMPLATE_VERTICES, rng)
     if person.scan_vertices <= TEMPLATE_VERTICES:
         scan = _reconstructed(after, faces, person.scan_vertices, rng)
@@ -176,7 +177,7 @@ class Clothes:
             for _ in range(3):
                 direction = rng.standard_normal(3) * [1.0, 0.7, 1.0]
                 direction *= 2 * np.pi / length_m / np.linalg.norm(direction)
-                waves.append((direction, rng.uniform(0, 2 * np.pi), rng.uniform(0.5, 2.5), amplitude))
+                waves.append((direction, rng.uniform(0, 2 * np.pi), rng.uniform(0.1, 0.8), amplitude))
         return Clothes(shaped, rest, normals, weights, faces, looseness, tuple(waves))
 
     def surface(self, pose: np.ndarray, progress: float) -> np.ndarray:
@@ -233,7 +234,9 @@ def _looseness(shaped: ShapedBody, rest: np.ndarray, weights: np.ndarray, rng: n
     trousers = (0.008 + rng.uniform(0.008, 0.02) * np.clip((hip - rest[:, 1]) / (hip - ankle), 0, 1)) * (
         rest[:, 1] > ankle + 0.04
     )
-    cloth = np.maximum(np.maximum(trunk, leg) * np.where(rest[:, 1] > hem, np.maximum(shirt, 0.012), trousers), arm * sleeves)
+    cloth = np.maximum(
+        np.maximum(trunk, leg) * np.where(rest[:, 1] > hem, np.maximum(shirt, 0.012), trousers), arm * sleeves
+    )
     return cloth * (share("head", "neck02", "neck03", "wrist", "foot") < 0.5)
 
 
@@ -262,9 +265,7 @@ def _turn_legs(shaped: ShapedBody, pose: np.ndarray, rng: np.random.Generator) -
         pose[names.index(f"lowerleg01.{side}")] = Rotation.from_euler("x", knee, degrees=True).as_matrix()
 
 
-def _moved(
-    clothes: Clothes, first: np.ndarray, last: np.ndarray, before: np.ndarray, motion_m: float
-) -> np.ndarray:
+def _moved(clothes: Clothes, first: np.ndarray, last: np.ndarray, before: np.ndarray, motion_m: float) -> np.ndarray:
     """The surface so far on the way from one pose to another, or beyond it, that it has moved by `motion_m`."""
     turn = (Rotation.from_matrix(last) * Rotation.from_matrix(first).inv()).as_rotvec()
     low, high, surface = 0.0, 1.6, before
@@ -279,6 +280,33 @@ def _moved(
         else:
             high = middle
     return surface
+
+
+def _lengths_kept(before: np.ndarray, after: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """What skinning and folds made, with the lengths of the cloth in the first pose: cloth hardly stretches."""
+    edges = unique_edges(faces)
+    lengths = np.linalg.norm(before[edges[:, 1]] - before[edges[:, 0]], axis=1)
+    return keep_lengths(after.copy(), edges, lengths, LENGTH_SWEEPS)
+
+
+@njit(cache=True)
+def keep_lengths(vertices, edges, lengths, sweeps):
+    """Gauss-Seidel over edges, to and fro; shortened edges push back more weakly than stretched ones pull."""
+    count = len(edges)
+    for sweep in range(sweeps):
+        for n in range(count):
+            e = n if sweep % 2 == 0 else count - 1 - n
+            a, b = edges[e, 0], edges[e, 1]
+            x = vertices[b, 0] - vertices[a, 0]
+            y = vertices[b, 1] - vertices[a, 1]
+            z = vertices[b, 2] - vertices[a, 2]
+            now = np.sqrt(x * x + y * y + z * z) + 1e-12
+            off = now - lengths[e]
+            share = (0.5 if off > 0 else 0.25) * 0.5 * off / now
+            for axis, along in enumerate((x, y, z)):
+                vertices[a, axis] += share * along
+                vertices[b, axis] -= share * along
+    return vertices
 
 
 # --- meshes ------------------------------------------------------------------------------------------------------

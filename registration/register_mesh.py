@@ -28,11 +28,9 @@ from capture4d.geometry.seams import weld
 from capture4d.mesh_files.meshes import WRITABLE, read_coloured_mesh, read_mesh, write_mesh
 from capture4d.types import Garment, GarmentScan, Mesh
 from capture4d.units import METRES, Units
-from registration.alignment import Similarity, align
 from registration.config import MeshRegistrationConfig
+from registration.mesh_fit import fit_mesh, judge
 from registration.quality import FrameQuality, assess
-from registration.register import prepare_frame, register_frame
-from registration.template import analyse_template
 
 __all__ = ["FindBorder", "MeshRegistration", "register_mesh", "run"]
 
@@ -55,6 +53,8 @@ class MeshRegistration:
     """The template after pre-alignment, in the files' unit."""
     quality: FrameQuality
     """Judged on the normalised problem; all its lengths, those in `reasons` too, are of the files' world."""
+    way: str = ""
+    """Which attempt counts: near, far, wide, or soft (`registration.mesh_fit`)."""
     estimated: bool = False
     """The scan came as points alone; its faces are made between them."""
     notes: tuple[str, ...] = ()
@@ -105,6 +105,7 @@ def run(
         "scan": str(scan_path),
         "units": units,
         "scan_faces": "estimated" if result.estimated else "given",
+        "way": result.way,
         "verdict": result.quality.verdict,
         "reasons": list(result.quality.reasons),
         **nan_to_none(result.quality.numbers),
@@ -168,24 +169,23 @@ def register_mesh(
     garment_scan = _garment_scan(
         surface.mesh, normalised(surface.mesh.vertices), surface.colours, find_border, config, scan_name
     )
-    if config.align != "none":
-        motion: Similarity = align(
-            start, garment_scan.mesh.vertices.astype(np.float64), with_scale=config.align == "similarity"
-        )
-        start = motion.apply(start)
     loops = {f"border_{index}": loop for index, loop in enumerate(boundary_loops(template.faces))}
     if config.border_colour and not loops:
         raise InputError(f"{template_name}: expected open borders, for --border-colour is given; found none")
     garment = Garment(Mesh(start.astype(np.float32), template.faces), loops)
-    analysis = analyse_template(garment, config.registration)
-    frame = prepare_frame(analysis, garment_scan, config.registration)
-    fitted = register_frame(analysis, frame, start, config=config.registration, schedule="cold")
+    marks = None
+    fitted = fit_mesh(garment, garment_scan, start, config, landmarks=marks)
     metres = METRES[config.units if config.units != "auto" else guess_units(template)]
-    quality = assess(analysis, frame, fitted.vertices, config.registration.quality, length_factor=metres / scale)
+    factor, limits = metres / scale, config.registration.quality
+    quality = assess(fitted.analysis, fitted.scan, fitted.vertices, limits, length_factor=factor)
+    verdict, reasons = judge(
+        quality, fitted.analysis, fitted.scan, fitted.vertices, config.scan_fit, length_factor=factor
+    )
     return MeshRegistration(
         vertices=(fitted.vertices / scale + origin).astype(np.float32)[split.of_vertex],
-        start=(start / scale + origin)[split.of_vertex],
-        quality=_at_vertices(quality, split.of_vertex),
+        start=(fitted.start / scale + origin)[split.of_vertex],
+        quality=_at_vertices(replace(quality, verdict=verdict, reasons=reasons), split.of_vertex),
+        way=fitted.way,
         estimated=surface.estimated,
     )
 
