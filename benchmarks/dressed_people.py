@@ -1,10 +1,10 @@
 """Whole dressed people as somebody else's capture would deliver them: pairs of meshes, with the truth between them.
 
-A person of the parametric body wears loose clothes, which are the body's own surface pushed outwards: a shirt that hangs
-below the hips, sleeves, trousers. Folds come and go with the pose. What is registered has nothing of that surface's
-triangles: the template is a closed mesh that Poisson reconstruction put around one pose, and the scan is either made in
-the same way or fused from virtual depth cameras, with 1 mm of noise at every vertex and round holes. Which piece of cloth
-a template vertex is, its nearest triangle on the person's own surface tells.
+A person of the parametric body wears loose clothes, which are the body's own surface pushed outwards: a shirt that
+hangs below the hips, sleeves, trousers. Folds come and go with the pose, and lengths are kept. What is registered has
+nothing of that surface's triangles: the template is a closed mesh that Poisson reconstruction put around one pose, and
+the scan is either made in the same way or fused from virtual depth cameras, with round holes; it has 1 mm of noise at
+every vertex. Which piece of cloth a template vertex is, its nearest triangle on the person's own surface tells.
 """
 
 from __future__ import annotations
@@ -234,9 +234,8 @@ def _looseness(shaped: ShapedBody, rest: np.ndarray, weights: np.ndarray, rng: n
     trousers = (0.008 + rng.uniform(0.008, 0.02) * np.clip((hip - rest[:, 1]) / (hip - ankle), 0, 1)) * (
         rest[:, 1] > ankle + 0.04
     )
-    cloth = np.maximum(
-        np.maximum(trunk, leg) * np.where(rest[:, 1] > hem, np.maximum(shirt, 0.012), trousers), arm * sleeves
-    )
+    hanging = np.where(rest[:, 1] > hem, np.maximum(shirt, 0.012), trousers)
+    cloth = np.maximum(np.maximum(trunk, leg) * hanging, arm * sleeves)
     return cloth * (share("head", "neck02", "neck03", "wrist", "foot") < 0.5)
 
 

@@ -2,9 +2,9 @@
 
 Nearest points mean nothing where an arm that hangs here is raised there. Here every scan point has one vote, which it
 divides among all template vertices by a Gaussian of their distance, and by how their normals agree: a raised arm that
-nothing explains pulls at the shoulder until the template's arm has swung there. The Gaussian narrows from step to step,
-and the deformation graph loosens as it does. Template vertices that no scan point votes for, as of half a person, follow
-their neighbours.
+nothing explains pulls at the shoulder until the template's arm has swung there. The Gaussian narrows from step to
+step, and the deformation graph loosens as it does. Template vertices that no scan point votes for, as of half a person,
+follow their neighbours.
 
 References: Myronenko and Song 2010 (coherent point drift); Sumner, Schmid, Pauly 2007 (the graph that moves).
 """
@@ -113,8 +113,8 @@ those of the arm beyond it."""
 
 
 def spread_evenly(points: Float64[np.ndarray, "points 3"], count: int) -> Int64[np.ndarray, " chosen"]:
-    """About `count` points, one of each occupied cell of a grid: as many a square metre where a mesh is fine as where it
-    is coarse. Indices, ascending."""
+    """About `count` points, one of each occupied cell of a grid: as dense where a mesh is coarse as where it is fine.
+    Indices, ascending."""
     if len(points) <= count:
         return np.arange(len(points))
     lower = points.min(axis=0)

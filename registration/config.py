@@ -314,12 +314,12 @@ class MeshRegistrationConfig:
     """Of both files; decides the millimetres of the report, never the result. auto: metres if the template's bounding
     box is less than 8 across, centimetres if less than 200, else millimetres."""
     align: Literal["auto", "none", "rigid", "similarity"] = "auto"
-    """Move the template onto the scan first, with scale for similarity; none if the two already lie on each other. auto:
-    as they lie, and moved rigidly where that leads nowhere."""
+    """Move the template onto the scan first, with scale for similarity; none if the two already lie on each other.
+    auto: as they lie, and moved rigidly where that leads nowhere."""
     lengths: Literal["auto", "kept", "free"] = "auto"
-    """kept: the scan shows the template's own thing, moved, and distances along the surface stay. free: it shows another
-    of its kind, as another face, and the template grows and shrinks. auto: kept, and free where the scan is not reached
-    so."""
+    """kept: the scan shows the template's own thing, moved, and distances along the surface stay. free: it shows
+    another of its kind, as another face, and the template grows and shrinks. auto: kept, and free where the scan is not
+    reached so."""
     registration: RegistrationConfig = RegistrationConfig()
     """Settings where lengths are kept, for a template whose diagonal is 1.2 m."""
     soft: RegistrationConfig = SOFT

@@ -44,8 +44,8 @@ BETTER = 0.8
 """A freer attempt has to bring the misfit down to this share, or lengths stay kept."""
 CLEARLY = 0.6
 """A rigid motion is taken that brings the distance down to this share; limbs that swing look like one that does not."""
-BENT = 0.02
-"""Mean distance, metres, of a bent template from its rigidly moved start."""
+SWUNG = 0.85
+"""Limbs had to swing where the way from afar brings the misfit down to this share of the near one's."""
 BORDER_MM = 5.0
 """Mean distance of the template's open borders from the scan above which it does not end where the scan does."""
 LEAST_MARKS = 3
@@ -99,6 +99,13 @@ class _Attempts:
     def reached(self) -> bool:
         """Whether the last attempt reached the scan."""
         return bool(self.made) and self.made[-1].reached
+
+    @property
+    def swung(self) -> bool:
+        """Whether the way from afar was needed: then the start is no start for others either."""
+        near = [attempt.misfit for attempt in self.made if attempt.fit.way == "near"]
+        others = [attempt.misfit for attempt in self.made if attempt.fit.way in ("far", "wide")]
+        return bool(others) and min(others) < SWUNG * min(near, default=np.inf)
 
     @property
     def best(self) -> _Attempt:
@@ -156,10 +163,15 @@ def _keeping_lengths(tried: _Attempts, start: np.ndarray, landmarks: Landmarks |
     if tried.fault is not None and config.align == "none":
         raise tried.fault
     if config.align == "auto" and landmarks is None:
-        start = _moved_there(start, scan)
+        moved = _moved_there(start, scan)
+        if moved is not start:
+            start = moved
+            tried.made.clear()
+            if config.lengths != "free" and tried.add("near", start, near):
+                return start
     if config.lengths == "free" or tried.add("far", start, lambda: far(config.approach.width[0])):
         return start
-    if tried.made and _is_bent(tried.made[-1].fit.vertices, start):
+    if tried.swung:
         tried.add("wide", start, lambda: far(config.approach.wider))
     return start
 
@@ -170,7 +182,7 @@ def _freeing_lengths(tried: _Attempts, start: np.ndarray) -> None:
     analysis = analyse_template(tried.garment, soft)
     scan = prepare_frame(analysis, tried.garment_scan, soft)
     there, settings = start, soft
-    if tried.made and _is_bent(tried.best.fit.vertices, start):
+    if tried.swung:
         there, settings = tried.best.fit.vertices, _dense_alone(soft)
     tried.add("soft", start, lambda: register_frame(analysis, scan, there, config=settings).vertices)
 
@@ -186,12 +198,6 @@ def _moved_there(start: np.ndarray, scan: FrameScan) -> np.ndarray:
         return float(there.mean() + back.mean())
 
     return moved if away(moved) < CLEARLY * away(start) else start
-
-
-def _is_bent(vertices: np.ndarray, start: np.ndarray) -> bool:
-    """Whether more than a rigid motion has moved the template from its start."""
-    rigid = fit_similarity(start, vertices, with_scale=False).apply(start)
-    return float(np.linalg.norm(vertices - rigid, axis=1).mean()) > BENT
 
 
 def _dense_alone(config: RegistrationConfig) -> RegistrationConfig:
