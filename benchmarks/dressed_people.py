@@ -31,7 +31,7 @@ from data_synth.scanner.config import FusionConfig, NoiseConfig, RigConfig, Scan
 from data_synth.scanner.rig import bounding_sphere, scanner_rig
 from data_synth.scanner.scan import LABEL_GARMENT, Surface, scan_surfaces
 
-__all__ = ["PEOPLE", "PeoplePair", "Person", "make_pair"]
+__all__ = ["PEOPLE", "SUBJECTS", "Clothes", "PeoplePair", "Person", "make_pair", "standing", "way_to"]
 
 VERSION = 4
 """Of what is kept in the user's cache; raise it when these pairs change."""
@@ -116,12 +116,11 @@ def make_pair(person: Person) -> PeoplePair:
 def _make(person: Person) -> Mapping[str, np.ndarray]:
     rng = np.random.default_rng([VERSION, person.seed])
     clothes = Clothes.tailor(with_shape(load_anny(), np.array(SUBJECTS[person.subject])), rng)
-    first = _standing(clothes.shaped, rng)
+    first = standing(clothes.shaped, rng)
     last = random_pose(clothes.shaped, rng)
     _turn_legs(clothes.shaped, last, rng)
-    before = clothes.surface(first, 0.0)
+    before, after = way_to(clothes, first, last, person.motion_m)
     faces = clothes.faces
-    after = _lengths_kept(before, _moved(clothes, first, last, before, person.motion_m), faces)
     template = _reconstructed(before, faces, TEMPLATE_VERTICES, rng)
     if person.scan_vertices <= TEMPLATE_VERTICES:
         scan = _reconstructed(after, faces, person.scan_vertices, rng)
@@ -242,7 +241,7 @@ def _looseness(shaped: ShapedBody, rest: np.ndarray, weights: np.ndarray, rng: n
 # --- poses -------------------------------------------------------------------------------------------------------
 
 
-def _standing(shaped: ShapedBody, rng: np.random.Generator) -> np.ndarray:
+def standing(shaped: ShapedBody, rng: np.random.Generator) -> np.ndarray:
     """Arms away from the trunk, as subjects are asked to stand; a little different each time."""
     names = shaped.body.joint_names
     pose = np.repeat(np.eye(3)[None], len(names), axis=0)
@@ -264,8 +263,9 @@ def _turn_legs(shaped: ShapedBody, pose: np.ndarray, rng: np.random.Generator) -
         pose[names.index(f"lowerleg01.{side}")] = Rotation.from_euler("x", knee, degrees=True).as_matrix()
 
 
-def _moved(clothes: Clothes, first: np.ndarray, last: np.ndarray, before: np.ndarray, motion_m: float) -> np.ndarray:
-    """The surface so far on the way from one pose to another, or beyond it, that it has moved by `motion_m`."""
+def way_to(clothes: Clothes, first: np.ndarray, last: np.ndarray, motion_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """The surface in one pose, and so far on the way to another, or beyond it, that it has moved by `motion_m`."""
+    before = clothes.surface(first, 0.0)
     turn = (Rotation.from_matrix(last) * Rotation.from_matrix(first).inv()).as_rotvec()
     low, high, surface = 0.0, 1.6, before
     areas = face_areas(before, clothes.faces)
@@ -278,7 +278,7 @@ def _moved(clothes: Clothes, first: np.ndarray, last: np.ndarray, before: np.nda
             low = middle
         else:
             high = middle
-    return surface
+    return before, _lengths_kept(before, surface, clothes.faces)
 
 
 def _lengths_kept(before: np.ndarray, after: np.ndarray, faces: np.ndarray) -> np.ndarray:

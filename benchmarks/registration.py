@@ -1,8 +1,9 @@
 """Registration against the truth, and against what else one can install.
 
-Three kinds of data: `synth`, a synthetic take of a T-shirt on a moving body (made once, kept in the user's cache);
+Kinds of data: `synth`, a synthetic take of a T-shirt on a moving body (made once, kept in the user's cache);
 `diffcloth`, a shirt simulated by somebody else, scanned by our scanner; `faces`, six faces in dense correspondence and
-one real scan. The last two are read from the folder `shared/data` beside the project.
+one real scan; and pairs of meshes for `register-mesh`: `people`, `borders`, `hopeless` (`benchmarks.mesh_pairs`).
+`diffcloth` and `faces` are read from the folder `shared/data` beside the project.
 
 Limits this was built against, on a take of 212 frames that ends in the pose it began with, with a template of 5,000
 vertices and scans of 200,000: truth distance 0.4 mm mean and 1.2 at 95 %, border 1.5 and 4 mm, correspondence 0.6 of
@@ -27,6 +28,7 @@ from rich.console import Console
 from scipy.spatial import KDTree
 
 from benchmarks.memory import peak_rss_mb
+from benchmarks.mesh_pairs import measure_borders, measure_hopeless, measure_people
 from benchmarks.metric import Metric
 from benchmarks.peers import PEERS, run_peer
 from capture4d.captures.capture import Capture, read_capture, write_capture_description
@@ -94,7 +96,7 @@ class Scores:
 def run(
     *,
     quick: bool = False,
-    data: Literal["synth", "diffcloth", "faces"] = "synth",
+    data: Literal["synth", "diffcloth", "faces", "people", "borders", "hopeless"] = "synth",
     frames: int = 212,
     compared: int = 6,
     workers: int = 2,
@@ -110,6 +112,9 @@ def run(
         workers: processes that make the take; registration itself is measured in one.
         capture: capture folder with truth to measure on instead of the cached synthetic take.
     """
+    pairs = {"people": measure_people, "borders": measure_borders, "hopeless": measure_hopeless}
+    if data in pairs:
+        return pairs[data](quick=quick)
     if data == "faces":
         return _faces(2 if quick else len(FACES))
     with tempfile.TemporaryDirectory(prefix="capture4d-registration-") as scratch:
@@ -315,9 +320,9 @@ def _first_frames(capture: Capture, folder: Path, count: int) -> Path:
 
 
 def _faces(count: int) -> list[Metric]:
-    """A face template to faces in dense correspondence, and to a real scan without; all start rigidly aligned."""
+    """A face template to faces in dense correspondence, and to a real scan without; all start where ours did."""
     template = _face("Template")
-    config = MeshRegistrationConfig(align="rigid", units="m")
+    config = MeshRegistrationConfig(units="m")
     rows: dict[str, list[list[float]]] = {name: [] for name in ("ours", *PEERS)}
     real: dict[str, float] = {}
     for name in [*FACES[:count], "DemoFace_10K"]:

@@ -44,6 +44,8 @@ BETTER = 0.8
 """A freer attempt has to bring the misfit down to this share, or lengths stay kept."""
 CLEARLY = 0.6
 """A rigid motion is taken that brings the distance down to this share; limbs that swing look like one that does not."""
+LIES_THERE = 0.02
+"""Sum of the mean distances either way, metres, below which a template lies on the scan already."""
 SWUNG = 0.85
 """Limbs had to swing where the way from afar brings the misfit down to this share of the near one's."""
 BORDER_MM = 5.0
@@ -158,7 +160,13 @@ def _keeping_lengths(tried: _Attempts, start: np.ndarray, landmarks: Landmarks |
         there = approach(analysis, scan.surface, start, config.approach, first_width=width, landmarks=landmarks)
         return register_frame(analysis, scan, there, config=_dense_alone(own)).vertices
 
-    if config.lengths != "free" and landmarks is None and tried.add("near", start, near):
+    def both() -> bool:
+        return (landmarks is None and tried.add("near", start, near)) or tried.add("far", start, first)
+
+    def first() -> np.ndarray:
+        return far(config.approach.width[0])
+
+    if config.lengths != "free" and both():
         return start
     if tried.fault is not None and config.align == "none":
         raise tried.fault
@@ -166,12 +174,10 @@ def _keeping_lengths(tried: _Attempts, start: np.ndarray, landmarks: Landmarks |
         moved = _moved_there(start, scan)
         if moved is not start:
             start = moved
-            tried.made.clear()
-            if config.lengths != "free" and tried.add("near", start, near):
+            if config.lengths != "free" and both():
                 return start
-    if config.lengths == "free" or tried.add("far", start, lambda: far(config.approach.width[0])):
-        return start
-    if tried.swung:
+    if config.lengths != "free" and tried.swung:
+        start = tried.best.fit.start
         tried.add("wide", start, lambda: far(config.approach.wider))
     return start
 
@@ -189,7 +195,6 @@ def _freeing_lengths(tried: _Attempts, start: np.ndarray) -> None:
 
 def _moved_there(start: np.ndarray, scan: FrameScan) -> np.ndarray:
     """The start, moved rigidly onto the scan if it is far nearer then."""
-    moved = align(start, scan.surface.points, with_scale=False).apply(start)
     own, other = spread_evenly(start, SAMPLES), spread_evenly(scan.surface.points, SAMPLES)
 
     def away(points: np.ndarray) -> float:
@@ -197,7 +202,11 @@ def _moved_there(start: np.ndarray, scan: FrameScan) -> np.ndarray:
         back = KDTree(points).query(scan.surface.points[other])[0]
         return float(there.mean() + back.mean())
 
-    return moved if away(moved) < CLEARLY * away(start) else start
+    now = away(start)
+    if now < LIES_THERE:
+        return start
+    moved = align(start, scan.surface.points, with_scale=False).apply(start)
+    return moved if away(moved) < CLEARLY * now else start
 
 
 def _dense_alone(config: RegistrationConfig) -> RegistrationConfig:

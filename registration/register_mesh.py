@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Float64
+from scipy.spatial import KDTree
 
 from capture4d.captures.scan_files import whole_surface
 from capture4d.colours.spaces import parse_colour
@@ -29,6 +30,7 @@ from capture4d.mesh_files.meshes import WRITABLE, read_coloured_mesh, read_mesh,
 from capture4d.types import Garment, GarmentScan, Mesh
 from capture4d.units import METRES, Units
 from registration.config import MeshRegistrationConfig
+from registration.landmarks import Landmarks, read_landmarks
 from registration.mesh_fit import fit_mesh, judge
 from registration.quality import FrameQuality, assess
 
@@ -67,12 +69,14 @@ def run(
     output_path: Path,
     config: MeshRegistrationConfig,
     *,
+    landmarks_path: Path | None = None,
     find_border: FindBorder | None = None,
     overwrite: bool = False,
 ) -> MeshRegistration:
     """Register one mesh file to another; writes the result, and its measures as JSON beside it.
 
     Args:
+        landmarks_path: pairs of places on the template and on the scan, as `registration.landmarks` reads them.
         output_path: .ply, .obj, .glb or .off; the JSON has the same name.
         overwrite: write over files that hold something else than this result.
     Raises:
@@ -85,13 +89,18 @@ def run(
             f"expected a mesh file ({', '.join(WRITABLE)}), found '{output_path.suffix}'", where=output_path
         )
     outputs, inputs = [output_path, output_path.with_suffix(".json")], [template_path, scan_path]
+    inputs += [] if landmarks_path is None else [landmarks_path]
     require_apart(outputs, inputs)
     known = _earlier(outputs, str(template_path), str(scan_path), overwrite)
     read_scan = read_coloured_mesh if config.border_colour else read_mesh
     template_file, scan_file = read_mesh(template_path), read_scan(scan_path, faces_needed=False)
+    landmarks = None
+    if landmarks_path is not None:
+        landmarks = read_landmarks(landmarks_path, template_file.mesh, scan_file.mesh)
     result = register_mesh(
         template_file.mesh,
         scan_file.mesh,
+        landmarks=landmarks,
         colours=scan_file.colours,
         config=config,
         find_border=find_border,
@@ -142,6 +151,7 @@ def register_mesh(
     colours: np.ndarray | None = None,
     config: MeshRegistrationConfig,
     find_border: FindBorder | None = None,
+    landmarks: Landmarks | None = None,
     template_name: str = "template",
     scan_name: str = "scan",
 ) -> MeshRegistration:
@@ -174,6 +184,9 @@ def register_mesh(
         raise InputError(f"{template_name}: expected open borders, for --border-colour is given; found none")
     garment = Garment(Mesh(start.astype(np.float32), template.faces), loops)
     marks = None
+    if landmarks is not None:
+        nearest = KDTree(template.vertices).query(landmarks.on_template)[1]
+        marks = np.asarray(nearest, np.int64), normalised(landmarks.on_scan)
     fitted = fit_mesh(garment, garment_scan, start, config, landmarks=marks)
     metres = METRES[config.units if config.units != "auto" else guess_units(template)]
     factor, limits = metres / scale, config.registration.quality
