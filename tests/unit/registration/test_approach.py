@@ -14,7 +14,6 @@ from registration.landmarks import Landmarks
 from registration.register_mesh import register_mesh
 from registration.template import analyse_template
 
-
 SLIM = np.array([0.35, 1.0, 0.35])
 """Makes a sleeve of the tube, which can be bent without being stretched."""
 
@@ -49,13 +48,13 @@ def test_a_bent_sleeve_is_followed(garment, scan_of, config) -> None:
 
 def test_what_is_not_scanned_follows_its_neighbours(garment, scan_of, config) -> None:
     analysis = analyse_template(garment, config)
-    scan = scan_of(lambda points: points + [0.05, 0.02, 0.0]).mesh
+    scan = scan_of(lambda points: points + np.array([0.05, 0.02, 0.0])).mesh
     upper = scan.faces[(scan.vertices[scan.faces, 1] > 0.27).all(axis=1)]
     surface = prepare_scan(scan.vertices, upper, smoothing_passes=0)
-    found = approach(analysis, surface, analysis.rest + [0.02, 0.02, 0.0], ApproachConfig())
+    found = approach(analysis, surface, analysis.rest + np.array([0.02, 0.02, 0.0]), ApproachConfig())
     lengths = np.linalg.norm(found[analysis.edges[:, 1]] - found[analysis.edges[:, 0]], axis=1)
     assert np.percentile(lengths / analysis.rest_lengths, 99) < 1.3
-    truth = analysis.rest + [0.05, 0.02, 0.0]
+    truth = analysis.rest + np.array([0.05, 0.02, 0.0])
     lower = analysis.rest[:, 1] < 0.2
     assert mean_error(found[lower, ::2], truth[lower, ::2]) < 0.01  # what slides along the tube no shape tells
 
