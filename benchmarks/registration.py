@@ -120,7 +120,8 @@ def run(
     with tempfile.TemporaryDirectory(prefix="capture4d-registration-") as scratch:
         if data == "diffcloth":
             scans = _scanned_diffcloth(Path(scratch) / "capture", 4 if quick else 13, workers)
-            return _take(scans, Path(scratch), 3 if quick else compared, start="previous")
+            near = _take(scans, Path(scratch), 3 if quick else compared, start="previous")
+            return near if quick else near + _far_diffcloth(Path(scratch) / "far", workers)
         take = read_capture(capture or _synthetic_take(quick, workers))
         first = _first_frames(take, Path(scratch) / "capture", frames)
         return _take(first, Path(scratch), 2 if quick else compared, start="skinned")
@@ -135,12 +136,27 @@ def _synthetic_take(quick: bool, workers: int) -> Path:
     )
 
 
-def _scanned_diffcloth(output: Path, frames: int, workers: int) -> Path:
+def _far_diffcloth(folder: Path, workers: int) -> list[Metric]:
+    """From the first frame to far ones at once, as two meshes without settings; correspondence."""
+    capture = read_capture(_scanned_diffcloth(folder / "capture", 6, workers, step=50))
+    extract(capture, folder / "garment", ExtractionSettings())
+    cases = list(_cases(capture, folder / "garment", "previous")(None))
+    metrics = []
+    for row in (2, 5):
+        result = register_mesh(
+            capture.template.template, cases[row].scan.mesh, config=MeshRegistrationConfig(units="m")
+        )
+        errors = correspondence_errors(result.vertices, cases[row].places)
+        metrics.append(Metric(f"far_{50 * row}_mm", float(1e3 * errors.mean()), "mm"))
+    return metrics
+
+
+def _scanned_diffcloth(output: Path, frames: int, workers: int, *, step: int = 10) -> Path:
     from data_synth.scan_stage import run as scan
     from data_synth.scanner.config import ScanConfig
 
     meshes = _shared("diffcloth-tshirt/sequence_a.npz")
-    scan(meshes, output, ScanConfig(height_m=0.7, frames=frames, step=10, fps=60.0), workers=workers)
+    scan(meshes, output, ScanConfig(height_m=0.7, frames=frames, step=step, fps=60.0), workers=workers)
     return output
 
 

@@ -298,6 +298,9 @@ class ScanFitConfig:
     """95th percentile of that distance above which the result is to be checked."""
     far_fail_mm: NonNegative = 12.0
     """The same above which it has failed: a limb of the scan is not reached."""
+    beyond_check_percent: Percent = 3.0
+    """Share of the scan beyond the template's open borders above which the result is to be checked: the scan shows more
+    than the template, or the template has not slid there."""
     flipped_fail_percent: Percent = 5.0
     """Share of faces against the scan's normals above which it has failed."""
     cut_fail_percent: Percent = 30.0

@@ -260,16 +260,18 @@ def judge(
     Args:
         length_factor: the reasons give lengths times this.
     """
-    away, nearest = scan_distances(analysis, scan, vertices)
+    every, nearest = scan_distances(analysis, scan, vertices)
     beyond = np.isin(nearest, analysis.border.vertices)  # of an open border, where the scan may go on
-    away = away if beyond.all() else away[~beyond]
+    away = every if beyond.all() else every[~beyond]
     mean, far = 1e3 * float(away.mean()), 1e3 * float(np.percentile(away, 95))
+    past = 100.0 * float((beyond & (1e3 * every > config.far_fail_mm)).mean())
     share = 100.0 / max(len(analysis.faces), 1)
     flipped, cut = quality.numbers["flipped_faces"] * share, quality.numbers["self_intersections"] * share
     failed, check = [], []
     for name, value, doubtful, wrong, unit in (
         ("mean distance from scan to template", mean, config.check_mm, config.fail_mm, " mm"),
         ("95 % of the scan within", far, config.far_check_mm, config.far_fail_mm, " mm"),
+        ("share of the scan beyond the template's borders", past, config.beyond_check_percent, np.inf, " %"),
         ("flipped faces", flipped, np.inf, config.flipped_fail_percent, " %"),
         ("self-intersecting faces", cut, np.inf, config.cut_fail_percent, " %"),
     ):

@@ -1,4 +1,4 @@
-"""From afar: a bent tube is followed, half of one too, and landmarks tell what shape does not."""
+"""From afar: a bent finger is followed, and half a tube; landmarks tell what shape does not."""
 
 from dataclasses import replace
 
@@ -14,36 +14,39 @@ from registration.landmarks import Landmarks
 from registration.register_mesh import register_mesh
 from registration.template import analyse_template
 
-SLIM = np.array([0.35, 1.0, 0.35])
-"""Makes a sleeve of the tube, which can be bent without being stretched."""
 
-
-def slim(garment: Garment) -> Garment:
-    return replace(garment, template=garment.template.with_vertices((garment.template.vertices * SLIM).astype("f4")))
-
-
-def bent(points: np.ndarray, degrees: float = 75.0) -> np.ndarray:
-    """The sleeve's axis becomes an arc above its lower fifth; lengths along the axis stay."""
+def finger(points: np.ndarray) -> np.ndarray:
+    """The tube, slim and all but closed at its upper end."""
     points = np.asarray(points, float)
+    narrow = 0.35 * np.sqrt(1.0 - 0.98 * np.clip((points[:, 1] - 0.2) / 0.3, 0.0, 1.0) ** 2)
+    return np.column_stack([points[:, 0] * narrow, points[:, 1], points[:, 2] * narrow])
+
+
+def bent(points: np.ndarray, degrees: float = 45.0) -> np.ndarray:
+    """The finger's axis becomes an arc above its lower fifth; lengths along the axis stay."""
+    points = finger(points)
     turn = np.radians(degrees) / 0.4
-    along = np.maximum(points[:, 1] - 0.1, 0.0)
-    angle, side = along * turn, points[:, 0]
+    angle, side = np.maximum(points[:, 1] - 0.1, 0.0) * turn, points[:, 0]
     x = (1.0 / turn) * (1.0 - np.cos(angle)) + side * np.cos(angle)
     y = np.minimum(points[:, 1], 0.1) + np.sin(angle) / turn - side * np.sin(angle)
     return np.column_stack([x, y, points[:, 2]])
+
+
+def straight(garment: Garment) -> Garment:
+    return replace(garment, template=garment.template.with_vertices(finger(garment.template.vertices).astype("f4")))
 
 
 def mean_error(found: np.ndarray, truth: np.ndarray) -> float:
     return float(np.linalg.norm(found - truth, axis=1).mean())
 
 
-def test_a_bent_sleeve_is_followed(garment, scan_of, config) -> None:
-    analysis = analyse_template(slim(garment), config)
-    scan = scan_of(lambda points: bent(points * SLIM), around=80, along=60).mesh
+def test_a_bent_finger_is_followed(garment, scan_of, config) -> None:
+    analysis = analyse_template(straight(garment), config)
+    scan = scan_of(bent, around=80, along=60).mesh
     surface = prepare_scan(scan.vertices, scan.faces, smoothing_passes=0)
-    truth = bent(analysis.rest)
+    truth = bent(garment.template.vertices)
     found = approach(analysis, surface, analysis.rest, ApproachConfig())
-    assert mean_error(found, truth) < 0.3 * mean_error(analysis.rest, truth)
+    assert mean_error(found, truth) < 0.4 * mean_error(analysis.rest, truth)
 
 
 def test_what_is_not_scanned_follows_its_neighbours(garment, scan_of, config) -> None:
@@ -59,13 +62,21 @@ def test_what_is_not_scanned_follows_its_neighbours(garment, scan_of, config) ->
     assert mean_error(found[lower, ::2], truth[lower, ::2]) < 0.01  # what slides along the tube no shape tells
 
 
-def test_two_meshes_far_apart_need_no_settings(garment, scan_of) -> None:
-    template = slim(garment).template
-    scan = scan_of(lambda points: bent(points * SLIM), around=80, along=60).mesh
-    result = register_mesh(template, scan, config=MeshRegistrationConfig())
-    assert result.way in ("far", "wide")
+def test_two_meshes_far_apart_need_no_schedule(garment, scan_of) -> None:
+    scan = scan_of(bent, around=80, along=60).mesh
+    config = MeshRegistrationConfig(align="none", lengths="kept")
+    result = register_mesh(straight(garment).template, scan, config=config)
+    assert result.way != "near"
     assert result.quality.verdict != "failed"
-    assert mean_error(result.vertices, bent(template.vertices)) < 0.02
+    assert mean_error(result.vertices, bent(garment.template.vertices)) < 0.01
+
+
+def test_what_lies_beyond_the_borders_is_told(garment, scan_of) -> None:
+    longer = scan_of(lambda points: points * [1.0, 1.5, 1.0], around=80, along=60).mesh
+    config = MeshRegistrationConfig(align="none", lengths="kept")
+    quality = register_mesh(garment.template, longer, config=config).quality
+    assert quality.verdict != "good"
+    assert any("beyond the template's borders" in reason for reason in quality.reasons)
 
 
 def test_landmarks_say_which_way_round(garment, scan_of) -> None:
