@@ -84,17 +84,22 @@ class _Attempts:
         self.made: list[_Attempt] = []
         self.fault: InputError | None = None
 
-    def add(self, way: str, start: np.ndarray, make: Callable[[], np.ndarray]) -> bool:
-        """Make one more; whether it reaches the scan. What lies too far off for it is kept as the pair's fault."""
+    def add(self, way: str, start: np.ndarray, make: Callable[[], np.ndarray], scan: FrameScan | None = None) -> bool:
+        """Make one more; whether it reaches the scan. What lies too far off for it is kept as the pair's fault.
+
+        Args:
+            scan: as this way sees it, if not as the others do.
+        """
+        scan = scan or self.scan
         try:
             vertices = make()
         except InputError as error:
             self.fault = self.fault or error
             return False
-        quality = assess(self.kept, self.scan, vertices, self.config.registration.quality)
-        fit = MeshFit(vertices, start, self.kept, self.scan, way)
-        reached = _reaches(self.kept, self.scan, vertices, self.config.scan_fit) and _tight(quality)
-        self.made.append(_Attempt(fit, _misfit(self.kept, self.scan, vertices), reached))
+        quality = assess(self.kept, scan, vertices, self.config.registration.quality)
+        fit = MeshFit(vertices, start, self.kept, scan, way)
+        reached = _reaches(self.kept, scan, vertices, self.config.scan_fit) and _tight(quality)
+        self.made.append(_Attempt(fit, _misfit(self.kept, scan, vertices), reached))
         return reached
 
     @property
@@ -190,7 +195,7 @@ def _freeing_lengths(tried: _Attempts, start: np.ndarray) -> None:
     there, settings = start, soft
     if tried.swung:
         there, settings = tried.best.fit.vertices, _dense_alone(soft)
-    tried.add("soft", start, lambda: register_frame(analysis, scan, there, config=settings).vertices)
+    tried.add("soft", start, lambda: register_frame(analysis, scan, there, config=settings).vertices, scan)
 
 
 def _moved_there(start: np.ndarray, scan: FrameScan) -> np.ndarray:
