@@ -1,8 +1,9 @@
 """Registration against the truth, and against what else one can install.
 
-Three kinds of data: `synth`, a synthetic take of a T-shirt on a moving body (made once, kept in the user's cache);
+Kinds of data: `synth`, a synthetic take of a T-shirt on a moving body (made once, kept in the user's cache);
 `diffcloth`, a shirt simulated by somebody else, scanned by our scanner; `faces`, six faces in dense correspondence and
-one real scan. The last two are read from the folder `shared/data` beside the project.
+one real scan; and pairs of meshes for `register-mesh`: `people`, `borders`, `hopeless` (`benchmarks.mesh_pairs`).
+`diffcloth` and `faces` are read from the folder `shared/data` beside the project.
 
 Limits this was built against, on a take of 212 frames that ends in the pose it began with, with a template of 5,000
 vertices and scans of 200,000: truth distance 0.4 mm mean and 1.2 at 95 %, border 1.5 and 4 mm, correspondence 0.6 of
@@ -27,6 +28,7 @@ from rich.console import Console
 from scipy.spatial import KDTree
 
 from benchmarks.memory import peak_rss_mb
+from benchmarks.mesh_pairs import measure_borders, measure_hopeless, measure_people
 from benchmarks.metric import Metric
 from benchmarks.peers import PEERS, run_peer
 from capture4d.captures.capture import Capture, read_capture, write_capture_description
@@ -94,7 +96,7 @@ class Scores:
 def run(
     *,
     quick: bool = False,
-    data: Literal["synth", "diffcloth", "faces"] = "synth",
+    data: Literal["synth", "diffcloth", "faces", "people", "borders", "hopeless"] = "synth",
     frames: int = 212,
     compared: int = 6,
     workers: int = 2,
@@ -110,12 +112,16 @@ def run(
         workers: processes that make the take; registration itself is measured in one.
         capture: capture folder with truth to measure on instead of the cached synthetic take.
     """
+    pairs = {"people": measure_people, "borders": measure_borders, "hopeless": measure_hopeless}
+    if data in pairs:
+        return pairs[data](quick=quick)
     if data == "faces":
         return _faces(2 if quick else len(FACES))
     with tempfile.TemporaryDirectory(prefix="capture4d-registration-") as scratch:
         if data == "diffcloth":
             scans = _scanned_diffcloth(Path(scratch) / "capture", 4 if quick else 13, workers)
-            return _take(scans, Path(scratch), 3 if quick else compared, start="previous")
+            near = _take(scans, Path(scratch), 3 if quick else compared, start="previous")
+            return near if quick else near + _far_diffcloth(Path(scratch) / "far", workers)
         take = read_capture(capture or _synthetic_take(quick, workers))
         first = _first_frames(take, Path(scratch) / "capture", frames)
         return _take(first, Path(scratch), 2 if quick else compared, start="skinned")
@@ -130,12 +136,27 @@ def _synthetic_take(quick: bool, workers: int) -> Path:
     )
 
 
-def _scanned_diffcloth(output: Path, frames: int, workers: int) -> Path:
+def _far_diffcloth(folder: Path, workers: int) -> list[Metric]:
+    """From the first frame to far ones at once, as two meshes without settings; correspondence."""
+    capture = read_capture(_scanned_diffcloth(folder / "capture", 6, workers, step=50))
+    extract(capture, folder / "garment", ExtractionSettings())
+    cases = list(_cases(capture, folder / "garment", "previous")(None))
+    metrics = []
+    for row in (2, 5):
+        result = register_mesh(
+            capture.template.template, cases[row].scan.mesh, config=MeshRegistrationConfig(units="m")
+        )
+        errors = correspondence_errors(result.vertices, cases[row].places)
+        metrics.append(Metric(f"far_{50 * row}_mm", float(1e3 * errors.mean()), "mm"))
+    return metrics
+
+
+def _scanned_diffcloth(output: Path, frames: int, workers: int, *, step: int = 10) -> Path:
     from data_synth.scan_stage import run as scan
     from data_synth.scanner.config import ScanConfig
 
     meshes = _shared("diffcloth-tshirt/sequence_a.npz")
-    scan(meshes, output, ScanConfig(height_m=0.7, frames=frames, step=10, fps=60.0), workers=workers)
+    scan(meshes, output, ScanConfig(height_m=0.7, frames=frames, step=step, fps=60.0), workers=workers)
     return output
 
 
@@ -315,9 +336,9 @@ def _first_frames(capture: Capture, folder: Path, count: int) -> Path:
 
 
 def _faces(count: int) -> list[Metric]:
-    """A face template to faces in dense correspondence, and to a real scan without; all start rigidly aligned."""
+    """A face template to faces in dense correspondence, and to a real scan without; all start where ours did."""
     template = _face("Template")
-    config = MeshRegistrationConfig(align="rigid", units="m")
+    config = MeshRegistrationConfig(units="m")
     rows: dict[str, list[list[float]]] = {name: [] for name in ("ours", *PEERS)}
     real: dict[str, float] = {}
     for name in [*FACES[:count], "DemoFace_10K"]:

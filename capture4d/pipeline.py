@@ -292,17 +292,16 @@ def register_mesh(
     output: Place,
     config: MeshRegistrationConfig | None = None,
     *,
+    landmarks: Place | None = None,
     overwrite: bool = False,
 ) -> MeshRegistration:
-    """Register one mesh file to another; writes the result, and its measures as JSON beside it.
-
-    `capture4d.register_mesh` does it with arrays.
-    """
+    """Register one mesh file to another, by a file of landmarks if given; `capture4d.register_mesh` takes arrays."""
     from capture4d.extraction.garment import painted_border
     from registration.register_mesh import run as stage
 
     given, config = (Path(template), Path(scan), Path(output)), config or MeshRegistrationConfig()
-    return stage(*given, config, find_border=painted_border, overwrite=overwrite)
+    marks = _maybe(landmarks)
+    return stage(*given, config, landmarks_path=marks, find_border=painted_border, overwrite=overwrite)
 
 
 @logged_stage("fit")

@@ -23,6 +23,7 @@ __all__ = [
     "PAPER",
     "PRESETS",
     "SOFT",
+    "ApproachConfig",
     "BoundaryConfig",
     "CoarseConfig",
     "DataConfig",
@@ -32,6 +33,7 @@ __all__ = [
     "MeshRegistrationConfig",
     "QualityConfig",
     "RegistrationConfig",
+    "ScanFitConfig",
     "Schedule",
     "SequenceConfig",
 ]
@@ -261,6 +263,55 @@ SOFT = RegistrationConfig(
 
 
 @settings
+class ApproachConfig:
+    """From a start that is far off: every scan point votes among all template vertices."""
+
+    steps: Count = 40
+    """Gauss-Newton steps; the votes are counted anew before each."""
+    width: tuple[Positive, Positive] = (0.06, 0.008)
+    """Standard deviation of the Gaussian by which a scan point divides its vote, metres, first and last step."""
+    wider: Positive = 0.1
+    """The same in the first step of a second attempt, where the first has failed."""
+    normal: NonNegative = 3.0
+    """How much less a vertex counts whose normal turns away: exp(-normal (1 - cosine))."""
+    reach: Positive = 3.5
+    """A scan point farther from all vertices than so many standard deviations has hardly a vote."""
+    rigid: tuple[NonNegative, NonNegative] = (5.0, 1.0)
+    """Weight of E_rigid, first and last step."""
+    smooth: tuple[NonNegative, NonNegative] = (0.5, 0.1)
+    """Weight of E_smooth."""
+    stretch: tuple[NonNegative, NonNegative] = (10.0, 3.0)
+    """Weight of the distances between nodes against the template's."""
+    landmarks: NonNegative = 3.0
+    """Weight of the mean squared distance between landmarks, where some are given."""
+    vertices: Count = 1500
+    """Template vertices that may be voted for."""
+    voters: Count = 2000
+    """Scan points that vote."""
+
+
+@settings
+class ScanFitConfig:
+    """When two meshes belong together: limits beside those of `QualityConfig`, for a template of 1.2 m."""
+
+    check_mm: NonNegative = 1.0
+    """Mean distance from the scan to the template above which the result is to be checked."""
+    fail_mm: NonNegative = 2.5
+    """The same above which it has failed."""
+    far_check_mm: NonNegative = 5.0
+    """95th percentile of that distance above which the result is to be checked."""
+    far_fail_mm: NonNegative = 12.0
+    """The same above which it has failed: a limb of the scan is not reached."""
+    beyond_check_percent: Percent = 3.0
+    """Share of the scan beyond the template's open borders above which the result is to be checked: the scan shows more
+    than the template, or the template has not slid there."""
+    flipped_fail_percent: Percent = 5.0
+    """Share of faces against the scan's normals above which it has failed."""
+    cut_fail_percent: Percent = 30.0
+    """Share of faces that cut another face above which it has failed."""
+
+
+@settings
 class MeshRegistrationConfig:
     """Any template onto any scan."""
 
@@ -269,7 +320,18 @@ class MeshRegistrationConfig:
     units: Literal["m", "cm", "mm", "in", "auto"] = "auto"
     """Of both files; decides the millimetres of the report, never the result. auto: metres if the template's bounding
     box is less than 8 across, centimetres if less than 200, else millimetres."""
-    align: Literal["none", "rigid", "similarity"] = "none"
-    """Move the template onto the scan first, with scale for similarity; none if the two already lie on each other."""
-    registration: RegistrationConfig = SOFT
-    """Settings of the registration itself, for a template whose diagonal is 1.2 m."""
+    align: Literal["auto", "none", "rigid", "similarity"] = "auto"
+    """Move the template onto the scan first, with scale for similarity; none if the two already lie on each other.
+    auto: as they lie, and moved rigidly where that leads nowhere."""
+    lengths: Literal["auto", "kept", "free"] = "auto"
+    """kept: the scan shows the template's own thing, moved, and distances along the surface stay. free: it shows
+    another of its kind, as another face, and the template grows and shrinks. auto: kept, and free where the scan is not
+    reached so."""
+    registration: RegistrationConfig = RegistrationConfig()
+    """Settings where lengths are kept, for a template whose diagonal is 1.2 m."""
+    soft: RegistrationConfig = SOFT
+    """Settings where lengths are free."""
+    approach: ApproachConfig = ApproachConfig()
+    """Settings of the way there where the template starts far off."""
+    scan_fit: ScanFitConfig = ScanFitConfig()
+    """When the scan counts as reached."""

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int32
+from jaxtyping import Bool, Float64, Int32, Int64
 from scipy.spatial import KDTree
 
 from capture4d.geometry.mesh import edge_lengths, edge_stretch, stretch_p99
@@ -29,7 +29,7 @@ from registration.correspondences import ScanSurface, mesh_normals, of_another_p
 from registration.register import FrameScan
 from registration.template import TemplateAnalysis, fold_cosines
 
-__all__ = ["REGION_MEASURES", "FrameQuality", "assess", "border_distances"]
+__all__ = ["REGION_MEASURES", "FrameQuality", "assess", "border_distances", "scan_distances"]
 
 Verdict = Literal["good", "check", "failed"]
 
@@ -123,8 +123,7 @@ def assess(
     flipped_vertices = np.zeros(len(vertices), bool)
     flipped_vertices[analysis.faces[flipped]] = True
     at_vertices, border = _border_errors(analysis, scan, vertices)
-    stride = max(1, len(scan.surface.points) // 4000)
-    scan_fit = 1e3 * _points_to_template(scan.surface.points[::stride], vertices, analysis)
+    scan_fit = 1e3 * scan_distances(analysis, scan, vertices)[0]
     fit = 1e3 * residual[covered]
     cut, creased = self_intersections(vertices, analysis.faces), _creased(analysis, vertices)
     numbers = {
@@ -249,12 +248,17 @@ def _mean_of_edges(values: np.ndarray, edges: np.ndarray, count: int) -> Float64
     return np.where(number > 0, np.bincount(ends, np.tile(values, 2), count) / np.maximum(number, 1), np.nan)
 
 
-def _points_to_template(points: np.ndarray, vertices: np.ndarray, analysis: TemplateAnalysis) -> np.ndarray:
-    """Distance to the faces around each point's nearest template vertex, metres."""
+def scan_distances(
+    analysis: TemplateAnalysis, scan: FrameScan, vertices: Float64[np.ndarray, "verts 3"]
+) -> tuple[Float64[np.ndarray, " points"], Int64[np.ndarray, " points"]]:
+    """Of some 4,000 scan points, the distance to the faces around each one's nearest template vertex, metres; and that
+    vertex."""
+    points = scan.surface.points[:: max(1, len(scan.surface.points) // 4000)]
     used = np.unique(analysis.faces)
     cell = 2.0 * float(analysis.rest_lengths.mean())
     nearest = used[PointGrid.build(vertices[used], cell).query(points)[1]]
-    return fan_distances(points, nearest, vertices, analysis.faces, analysis.fan_offsets, analysis.fan_faces)
+    away = fan_distances(points, nearest, vertices, analysis.faces, analysis.fan_offsets, analysis.fan_faces)
+    return away, nearest.astype(np.int64)
 
 
 def _judge(

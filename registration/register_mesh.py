@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Float64
+from scipy.spatial import KDTree
 
 from capture4d.captures.scan_files import whole_surface
 from capture4d.colours.spaces import parse_colour
@@ -28,11 +29,10 @@ from capture4d.geometry.seams import weld
 from capture4d.mesh_files.meshes import WRITABLE, read_coloured_mesh, read_mesh, write_mesh
 from capture4d.types import Garment, GarmentScan, Mesh
 from capture4d.units import METRES, Units
-from registration.alignment import Similarity, align
 from registration.config import MeshRegistrationConfig
+from registration.landmarks import Landmarks, read_landmarks
+from registration.mesh_fit import fit_mesh, judge
 from registration.quality import FrameQuality, assess
-from registration.register import prepare_frame, register_frame
-from registration.template import analyse_template
 
 __all__ = ["FindBorder", "MeshRegistration", "register_mesh", "run"]
 
@@ -55,6 +55,8 @@ class MeshRegistration:
     """The template after pre-alignment, in the files' unit."""
     quality: FrameQuality
     """Judged on the normalised problem; all its lengths, those in `reasons` too, are of the files' world."""
+    way: str = ""
+    """Which attempt counts: near, far, wide, or soft (`registration.mesh_fit`)."""
     estimated: bool = False
     """The scan came as points alone; its faces are made between them."""
     notes: tuple[str, ...] = ()
@@ -67,12 +69,14 @@ def run(
     output_path: Path,
     config: MeshRegistrationConfig,
     *,
+    landmarks_path: Path | None = None,
     find_border: FindBorder | None = None,
     overwrite: bool = False,
 ) -> MeshRegistration:
     """Register one mesh file to another; writes the result, and its measures as JSON beside it.
 
     Args:
+        landmarks_path: pairs of places on the template and on the scan, as `registration.landmarks` reads them.
         output_path: .ply, .obj, .glb or .off; the JSON has the same name.
         overwrite: write over files that hold something else than this result.
     Raises:
@@ -85,13 +89,18 @@ def run(
             f"expected a mesh file ({', '.join(WRITABLE)}), found '{output_path.suffix}'", where=output_path
         )
     outputs, inputs = [output_path, output_path.with_suffix(".json")], [template_path, scan_path]
+    inputs += [] if landmarks_path is None else [landmarks_path]
     require_apart(outputs, inputs)
     known = _earlier(outputs, str(template_path), str(scan_path), overwrite)
     read_scan = read_coloured_mesh if config.border_colour else read_mesh
     template_file, scan_file = read_mesh(template_path), read_scan(scan_path, faces_needed=False)
+    landmarks = None
+    if landmarks_path is not None:
+        landmarks = read_landmarks(landmarks_path, template_file.mesh, scan_file.mesh)
     result = register_mesh(
         template_file.mesh,
         scan_file.mesh,
+        landmarks=landmarks,
         colours=scan_file.colours,
         config=config,
         find_border=find_border,
@@ -105,6 +114,7 @@ def run(
         "scan": str(scan_path),
         "units": units,
         "scan_faces": "estimated" if result.estimated else "given",
+        "way": result.way,
         "verdict": result.quality.verdict,
         "reasons": list(result.quality.reasons),
         **nan_to_none(result.quality.numbers),
@@ -141,6 +151,7 @@ def register_mesh(
     colours: np.ndarray | None = None,
     config: MeshRegistrationConfig,
     find_border: FindBorder | None = None,
+    landmarks: Landmarks | None = None,
     template_name: str = "template",
     scan_name: str = "scan",
 ) -> MeshRegistration:
@@ -168,24 +179,26 @@ def register_mesh(
     garment_scan = _garment_scan(
         surface.mesh, normalised(surface.mesh.vertices), surface.colours, find_border, config, scan_name
     )
-    if config.align != "none":
-        motion: Similarity = align(
-            start, garment_scan.mesh.vertices.astype(np.float64), with_scale=config.align == "similarity"
-        )
-        start = motion.apply(start)
     loops = {f"border_{index}": loop for index, loop in enumerate(boundary_loops(template.faces))}
     if config.border_colour and not loops:
         raise InputError(f"{template_name}: expected open borders, for --border-colour is given; found none")
     garment = Garment(Mesh(start.astype(np.float32), template.faces), loops)
-    analysis = analyse_template(garment, config.registration)
-    frame = prepare_frame(analysis, garment_scan, config.registration)
-    fitted = register_frame(analysis, frame, start, config=config.registration, schedule="cold")
+    marks = None
+    if landmarks is not None:
+        nearest = KDTree(template.vertices).query(landmarks.on_template)[1]
+        marks = np.asarray(nearest, np.int64), normalised(landmarks.on_scan)
+    fitted = fit_mesh(garment, garment_scan, start, config, landmarks=marks)
     metres = METRES[config.units if config.units != "auto" else guess_units(template)]
-    quality = assess(analysis, frame, fitted.vertices, config.registration.quality, length_factor=metres / scale)
+    factor, limits = metres / scale, config.registration.quality
+    quality = assess(fitted.analysis, fitted.scan, fitted.vertices, limits, length_factor=factor)
+    verdict, reasons = judge(
+        quality, fitted.analysis, fitted.scan, fitted.vertices, config.scan_fit, length_factor=factor
+    )
     return MeshRegistration(
         vertices=(fitted.vertices / scale + origin).astype(np.float32)[split.of_vertex],
-        start=(start / scale + origin)[split.of_vertex],
-        quality=_at_vertices(quality, split.of_vertex),
+        start=(fitted.start / scale + origin)[split.of_vertex],
+        quality=_at_vertices(replace(quality, verdict=verdict, reasons=reasons), split.of_vertex),
+        way=fitted.way,
         estimated=surface.estimated,
     )
 

@@ -89,13 +89,19 @@ class RegisterMesh(FileOptions, MeshOptions):
     """Mesh to fit it to: obj, ply, glb, gltf, stl or off; a point cloud gets faces between its points."""
     output: Path
     """Mesh to write: ply, obj, glb or off; the JSON has the same name."""
+    landmarks: Path | None = None
+    """Text file of pairs, one a line: a template vertex and a scan vertex, counted from 0, or a point of each, six
+    coordinates. Needed where the two are too far apart to find each other."""
     config: Annotated[MeshRegistrationConfig, arg(name="")] = field(default_factory=MeshRegistrationConfig)
 
     def __call__(self) -> int:
         from capture4d import pipeline
 
-        result = pipeline.register_mesh(self.template, self.scan, self.output, self.config, overwrite=self.overwrite)
-        print(f"registered: {self.output}, measures: {self.output.with_suffix('.json')}")
+        result = pipeline.register_mesh(
+            self.template, self.scan, self.output, self.config, landmarks=self.landmarks, overwrite=self.overwrite
+        )
+        said = {"good": "registered", "check": "registered, to check"}.get(result.quality.verdict, "failed")
+        print(f"{said}: {self.output}, measures: {self.output.with_suffix('.json')}")
         for note in result.notes:
             print(f"capture4d: {note}", file=sys.stderr)
         if result.estimated:

@@ -426,6 +426,14 @@ def test_register_mesh_keeps_the_templates_faces_and_measures(
     assert measures["boundary_mean_mm"] < 5
     assert measures["cpu_s"] > 0
 
+    half = tmp_path / "half.ply"
+    write_mesh(half, mesh.with_vertices(0.4 * mesh.vertices))
+    assert run("register-mesh", template, half, "--output", tmp_path / "3.ply", "--lengths", "kept") == 3
+    said = capsys.readouterr()
+    assert said.out.endswith(f"failed: {tmp_path / '3.ply'}, measures: {tmp_path / '3.json'}\n")
+    assert "3.ply: failed: " in said.err
+    assert len(read_mesh(tmp_path / "3.ply").mesh.vertices) == len(mesh.vertices)
+
     uncoloured = tmp_path / "uncoloured.ply"
     write_mesh(uncoloured, read_mesh(scan).mesh)
     command = ("register-mesh", template, uncoloured, "--output", tmp_path / "2.ply", "--border-colour", "ffd200")

@@ -1,0 +1,291 @@
+"""Which way a template is brought onto a scan that nobody has told us anything about.
+
+In this order, until the scan is reached:
+
+    near       as a garment of the frame before: coarse, then vertex by vertex, with lengths kept
+    far        drawn there as a whole first (`approach`), then vertex by vertex; from where a rigid motion puts the
+               template, if that is far nearer and `align` may
+    wide       the same with wider votes, where limbs had to swing
+    soft       growing and shrinking, for what is another of its kind
+
+Each attempt is judged by what of the scan it leaves unreached, and what of itself away from the scan; the best counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float64, Int64
+from scipy.spatial import KDTree
+
+from capture4d.errors import InputError
+from capture4d.types import Garment, GarmentScan
+from registration.alignment import align, fit_similarity
+from registration.approach import approach, spread_evenly
+from registration.config import MeshRegistrationConfig, RegistrationConfig, ScanFitConfig
+from registration.correspondences import mesh_normals
+from registration.quality import FrameQuality, assess, scan_distances
+from registration.register import FrameScan, prepare_frame, register_frame
+from registration.template import TemplateAnalysis, analyse_template
+
+__all__ = ["Landmarks", "MeshFit", "fit_mesh", "judge"]
+
+Landmarks = tuple[Int64[np.ndarray, " marks"], Float64[np.ndarray, "marks 3"]]
+"""Template vertices, and their places on the scan."""
+
+NORMAL_LENGTH = 0.03
+"""What a normal turned by 60 degrees counts as among distances, metres, when attempts are compared."""
+FARTHEST = 0.1
+"""Beyond this, metres, one is as far off as another."""
+SAMPLES = 4000
+BETTER = 0.8
+"""A freer attempt has to bring the misfit down to this share, or lengths stay kept."""
+CLEARLY = 0.6
+"""A rigid motion is taken that brings the distance down to this share; limbs that swing look like one that does not."""
+LIES_THERE = 0.02
+"""Sum of the mean distances either way, metres, below which a template lies on the scan already."""
+SWUNG = 0.85
+"""Limbs had to swing where the way from afar brings the misfit down to this share of the near one's."""
+BORDER_MM = 5.0
+"""Mean distance of the template's open borders from the scan above which it does not end where the scan does."""
+LEAST_MARKS = 3
+"""Landmarks that fix a rigid motion."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeshFit:
+    """The attempt that counts."""
+
+    vertices: Float64[np.ndarray, "verts 3"]
+    start: Float64[np.ndarray, "verts 3"]
+    """Where it started from, aligned or not."""
+    analysis: TemplateAnalysis
+    scan: FrameScan
+    way: str
+    """near, far, wide, or soft."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Attempt:
+    fit: MeshFit
+    misfit: float
+    reached: bool
+
+
+class _Attempts:
+    """What has been tried on one pair."""
+
+    def __init__(self, garment: Garment, scan: GarmentScan, config: MeshRegistrationConfig) -> None:
+        self.garment, self.garment_scan, self.config = garment, scan, config
+        self.kept = analyse_template(garment, config.registration)
+        self.scan = prepare_frame(self.kept, scan, config.registration)
+        self.made: list[_Attempt] = []
+        self.fault: InputError | None = None
+
+    def add(self, way: str, start: np.ndarray, make: Callable[[], np.ndarray], scan: FrameScan | None = None) -> bool:
+        """Make one more; whether it reaches the scan. What lies too far off for it is kept as the pair's fault.
+
+        Args:
+            scan: as this way sees it, if not as the others do.
+        """
+        scan = scan or self.scan
+        try:
+            vertices = make()
+        except InputError as error:
+            self.fault = self.fault or error
+            return False
+        quality = assess(self.kept, scan, vertices, self.config.registration.quality)
+        fit = MeshFit(vertices, start, self.kept, scan, way)
+        reached = _reaches(self.kept, scan, vertices, self.config.scan_fit) and _tight(quality)
+        self.made.append(_Attempt(fit, _misfit(self.kept, scan, vertices), reached))
+        return reached
+
+    @property
+    def reached(self) -> bool:
+        """Whether the last attempt reached the scan."""
+        return bool(self.made) and self.made[-1].reached
+
+    @property
+    def swung(self) -> bool:
+        """Whether the way from afar was needed: then the start is no start for others either."""
+        near = [attempt.misfit for attempt in self.made if attempt.fit.way == "near"]
+        others = [attempt.misfit for attempt in self.made if attempt.fit.way in ("far", "wide")]
+        return bool(others) and min(others) < SWUNG * min(near, default=np.inf)
+
+    @property
+    def best(self) -> _Attempt:
+        return min(self.made, key=lambda attempt: attempt.misfit)
+
+
+def fit_mesh(
+    garment: Garment,
+    scan: GarmentScan,
+    start: Float64[np.ndarray, "verts 3"],
+    config: MeshRegistrationConfig,
+    *,
+    landmarks: Landmarks | None = None,
+) -> MeshFit:
+    """The template on the scan, by the first way that reaches it.
+
+    Args:
+        garment, scan, start: brought to the size that the settings are made for, metres.
+    Raises:
+        InputError: nothing of the scan lies near the start, and `align` may not move it.
+    """
+    tried = _Attempts(garment, scan, config)
+    points = tried.scan.surface.points
+    if config.align in ("rigid", "similarity"):
+        start = align(start, points, with_scale=config.align == "similarity").apply(start)
+    elif config.align == "auto" and landmarks is not None and len(landmarks[0]) >= LEAST_MARKS:
+        start = fit_similarity(start[landmarks[0]], landmarks[1], with_scale=False).apply(start)
+    start = _keeping_lengths(tried, start, landmarks)
+    if config.lengths == "free" or not (tried.reached or config.lengths == "kept"):
+        _freeing_lengths(tried, start)
+    if not tried.made:
+        assert tried.fault is not None, "an attempt is made or has a fault"
+        raise tried.fault
+    kept = [attempt for attempt in tried.made if attempt.fit.way != "soft"]
+    if not kept:
+        return tried.best.fit
+    closest = min(kept, key=lambda attempt: attempt.misfit)
+    return tried.best.fit if tried.best.misfit < BETTER * closest.misfit else closest.fit
+
+
+def _keeping_lengths(tried: _Attempts, start: np.ndarray, landmarks: Landmarks | None) -> np.ndarray:
+    """Near, far and wide, until one reaches the scan; and the start, which a rigid motion may have brought there."""
+    config, analysis, scan = tried.config, tried.kept, tried.scan
+    own = config.registration
+
+    def near() -> np.ndarray:
+        return register_frame(analysis, scan, start, config=own).vertices
+
+    def far(width: float) -> np.ndarray:
+        there = approach(analysis, scan.surface, start, config.approach, first_width=width, landmarks=landmarks)
+        return register_frame(analysis, scan, there, config=_dense_alone(own)).vertices
+
+    def both() -> bool:
+        return (landmarks is None and tried.add("near", start, near)) or tried.add("far", start, first)
+
+    def first() -> np.ndarray:
+        return far(config.approach.width[0])
+
+    if config.lengths != "free" and both():
+        return start
+    if tried.fault is not None and config.align == "none":
+        raise tried.fault
+    if config.align == "auto" and landmarks is None:
+        moved = _moved_there(start, scan)
+        if moved is not start:
+            start = moved
+            if config.lengths != "free" and both():
+                return start
+    if config.lengths != "free" and tried.swung:
+        start = tried.best.fit.start
+        tried.add("wide", start, lambda: far(config.approach.wider))
+    return start
+
+
+def _freeing_lengths(tried: _Attempts, start: np.ndarray) -> None:
+    """Soft, from the start; where limbs had to swing, from where the lengths let them come."""
+    soft = tried.config.soft
+    analysis = analyse_template(tried.garment, soft)
+    scan = prepare_frame(analysis, tried.garment_scan, soft)
+    there, settings = start, soft
+    if tried.swung:
+        there, settings = tried.best.fit.vertices, _dense_alone(soft)
+    tried.add("soft", start, lambda: register_frame(analysis, scan, there, config=settings).vertices, scan)
+
+
+def _moved_there(start: np.ndarray, scan: FrameScan) -> np.ndarray:
+    """The start, moved rigidly onto the scan if it is far nearer then."""
+    own, other = spread_evenly(start, SAMPLES), spread_evenly(scan.surface.points, SAMPLES)
+
+    def away(points: np.ndarray) -> float:
+        there = KDTree(scan.surface.points).query(points[own])[0]
+        back = KDTree(points).query(scan.surface.points[other])[0]
+        return float(there.mean() + back.mean())
+
+    now = away(start)
+    if now < LIES_THERE:
+        return start
+    moved = align(start, scan.surface.points, with_scale=False).apply(start)
+    return moved if away(moved) < CLEARLY * now else start
+
+
+def _dense_alone(config: RegistrationConfig) -> RegistrationConfig:
+    """Where the template lies on the scan already, nodes only push it about."""
+    cold = replace(config.coarse.cold, steps=0)
+    return replace(config, coarse=replace(config.coarse, cold=cold))
+
+
+def _misfit(analysis: TemplateAnalysis, scan: FrameScan, vertices: np.ndarray) -> float:
+    """Mean distance from scan to template and from template to scan, in position and normal, metres."""
+    normals = mesh_normals(vertices, analysis.faces)
+    own = spread_evenly(vertices, SAMPLES)
+    other = spread_evenly(scan.surface.points, SAMPLES)
+    here = np.concatenate([vertices, NORMAL_LENGTH * normals], axis=1)
+    there = np.concatenate([scan.surface.points, NORMAL_LENGTH * scan.surface.normals], axis=1)
+    back, forth = KDTree(here).query(there[other])[0], KDTree(there).query(here[own])[0]
+    return float(np.minimum(back, FARTHEST).mean() + np.minimum(forth, FARTHEST).mean())
+
+
+# --- verdicts ----------------------------------------------------------------------------------------------------
+
+TIGHT_MM, TIGHT_STRETCH = 0.8, 1.6
+"""Mean distance from template to scan, and 99th percentile of the stretch, of what needs no other attempt."""
+
+
+def _tight(quality: FrameQuality) -> bool:
+    numbers = quality.numbers
+    return numbers["fit_mean_mm"] <= TIGHT_MM and numbers["stretch_p99"] <= TIGHT_STRETCH
+
+
+def _reaches(analysis: TemplateAnalysis, scan: FrameScan, vertices: np.ndarray, config: ScanFitConfig) -> bool:
+    """Whether the template lies on all of the scan, beyond its borders as well, and ends where the scan does."""
+    away = 1e3 * scan_distances(analysis, scan, vertices)[0]
+    border = vertices[analysis.border.vertices]
+    hanging = 1e3 * float(scan.surface.grid.query(border)[0].mean()) if len(border) else 0.0
+    ends = hanging <= BORDER_MM + 1e3 * scan.surface.spacing
+    return bool(ends and away.mean() <= config.check_mm and np.percentile(away, 95) <= config.far_check_mm)
+
+
+def judge(
+    quality: FrameQuality,
+    analysis: TemplateAnalysis,
+    scan: FrameScan,
+    vertices: Float64[np.ndarray, "verts 3"],
+    config: ScanFitConfig,
+    *,
+    length_factor: float = 1.0,
+) -> tuple[str, tuple[str, ...]]:
+    """Verdict and reasons, with what a take's frames are not judged by: what of the scan the template leaves unreached.
+
+    Args:
+        length_factor: the reasons give lengths times this.
+    """
+    every, nearest = scan_distances(analysis, scan, vertices)
+    beyond = np.isin(nearest, analysis.border.vertices)  # of an open border, where the scan may go on
+    away = every if beyond.all() else every[~beyond]
+    mean, far = 1e3 * float(away.mean()), 1e3 * float(np.percentile(away, 95))
+    past = 100.0 * float((beyond & (1e3 * every > config.far_fail_mm)).mean())
+    share = 100.0 / max(len(analysis.faces), 1)
+    flipped, cut = quality.numbers["flipped_faces"] * share, quality.numbers["self_intersections"] * share
+    failed, check = [], []
+    for name, value, doubtful, wrong, unit in (
+        ("mean distance from scan to template", mean, config.check_mm, config.fail_mm, " mm"),
+        ("95 % of the scan within", far, config.far_check_mm, config.far_fail_mm, " mm"),
+        ("share of the scan beyond the template's borders", past, config.beyond_check_percent, np.inf, " %"),
+        ("flipped faces", flipped, np.inf, config.flipped_fail_percent, " %"),
+        ("self-intersecting faces", cut, np.inf, config.cut_fail_percent, " %"),
+    ):
+        factor = length_factor if unit == " mm" else 1.0
+        if value > doubtful or value > wrong:
+            limit = wrong if value > wrong else doubtful
+            (failed if value > wrong else check).append(f"{name} {value * factor:.3g} > {limit * factor:.3g}{unit}")
+    if failed or quality.verdict == "failed":
+        return "failed", ((*quality.reasons,) if quality.verdict == "failed" else ()) + tuple(failed)
+    if check or quality.verdict == "check":
+        return "check", (*quality.reasons, *check)
+    return "good", ()
