@@ -24,6 +24,7 @@ __all__ = [
     "PRESETS",
     "SOFT",
     "BoundaryConfig",
+    "ColourConfig",
     "CoarseConfig",
     "DataConfig",
     "DenseConfig",
@@ -98,6 +99,22 @@ class BoundaryConfig:
     """Farthest target, metres."""
     max_points: Count = 3000
     """Scan border points are thinned to this many."""
+
+
+@settings
+class ColourConfig:
+    """What is printed on the cloth, in the dense stage: it shows how the cloth slides."""
+
+    weight: NonNegative = 2.0
+    """Where the colours are as steep as usual, beside 1 of the distance to the scan's planes."""
+    robust: Positive = 0.3
+    """Scale of the Geman-McClure weight, as a share of the colours' variance."""
+    steps: Whole = 3
+    """Gauss-Newton steps that follow those of the dense stage, with its last weights."""
+    wide_steps: Whole = 3
+    """Steps on colours that are blurred widely, before those on sharper ones."""
+    look_up: tuple[Whole, ...] = (0, 3, 5)
+    """Steps."""
 
 
 @settings
@@ -214,6 +231,7 @@ class RegistrationConfig:
     coarse: CoarseConfig = field(default_factory=CoarseConfig)
     dense: DenseConfig = field(default_factory=DenseConfig)
     sequence: SequenceConfig = field(default_factory=SequenceConfig)
+    colour: ColourConfig = field(default_factory=ColourConfig)
     quality: QualityConfig = field(default_factory=QualityConfig)
 
 

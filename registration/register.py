@@ -5,6 +5,7 @@ References: DeepWrinkles (ECCV 2018), section 3.1, Eq. 1-2; the dense stage and 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -14,7 +15,8 @@ from jaxtyping import Float, Float64
 from capture4d.errors import InputError
 from capture4d.types import GarmentScan
 from registration.boundary import BorderTargets, border_targets, tangent_free_metric
-from registration.config import BoundaryRule, RegistrationConfig, Schedule
+from registration.colour_term import ClothColours, SeenColours, colour_term, log_colours, see_colours
+from registration.config import BoundaryRule, ColourConfig, RegistrationConfig, Schedule
 from registration.correspondences import (
     Gates,
     ScanSurface,
@@ -45,6 +47,8 @@ class FrameScan:
     border_loops: np.ndarray
     """(points,) int32: index of the template's loop, or -1 where the paint does not tell."""
     frame_id: int
+    colours: Float64[np.ndarray, "points 3"] | None = None
+    """Logarithms of the surface's colours; None where they are not to be compared."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,9 +62,13 @@ class FrameRegistration:
     """Conjugate gradient iterations over all steps."""
 
 
-def prepare_frame(analysis: TemplateAnalysis, scan: GarmentScan, config: RegistrationConfig) -> FrameScan:
+def prepare_frame(
+    analysis: TemplateAnalysis, scan: GarmentScan, config: RegistrationConfig, *, coloured: bool = False
+) -> FrameScan:
     """Smooth the scan, take its normals, sort its points into cells, thin its border points.
 
+    Args:
+        coloured: make its colours ready too, if it has any.
     Raises:
         UnknownBorderError: a paint is named after a loop that the template lacks.
         InputError: the garment scan is empty.
@@ -68,6 +76,7 @@ def prepare_frame(analysis: TemplateAnalysis, scan: GarmentScan, config: Registr
     if not len(scan.mesh.faces):
         raise InputError(f"frame {scan.frame_id}: expected a garment scan with faces, found none")
     surface = prepare_scan(scan.mesh.vertices, scan.mesh.faces, smoothing_passes=config.data.smoothing_passes)
+    colours = None if scan.colours is None or not coloured else log_colours(surface.of_points(scan.colours))
     told = np.unique(scan.boundary_loops[scan.boundary_loops >= 0])
     require_borders(analysis.border, [scan.loop_names[loop] for loop in told])
     stride = max(1, -(-len(scan.boundary_points) // config.boundary.max_points))
@@ -75,7 +84,7 @@ def prepare_frame(analysis: TemplateAnalysis, scan: GarmentScan, config: Registr
     renumbered = np.array([names.get(name, -1) for name in scan.loop_names] + [-1], np.int32)
     loops = renumbered[scan.boundary_loops[::stride]]
     points = scan.boundary_points[::stride].astype(np.float64)
-    return FrameScan(surface, points, loops, scan.frame_id)
+    return FrameScan(surface, points, loops, scan.frame_id, colours)
 
 
 def register_frame(
@@ -85,10 +94,12 @@ def register_frame(
     *,
     config: RegistrationConfig,
     schedule: Literal["cold", "warm"] = "cold",
+    cloth: Sequence[ClothColours] = (),
 ) -> FrameRegistration:
     """Deform the template onto one scan by non-rigid ICP.
 
     Args:
+        cloth: colours of the template, the most blurred first; with them those of the scan take part.
         initial_vertices: start of the search, metres, world frame: the skinned template, or the predicted frame.
         schedule: cold from a distant start, warm from the frame before.
     Raises:
@@ -102,7 +113,9 @@ def register_frame(
     coarse = config.coarse.cold if schedule == "cold" else config.coarse.warm
     dense = config.dense.cold if schedule == "cold" else config.dense.warm
     vertices, first = _coarse_stage(analysis, scan, start, coarse, config, near=schedule == "warm")
-    vertices, second = _dense_stage(analysis, scan, start, vertices, dense, config, near=schedule == "warm")
+    vertices, second = _dense_stage(
+        analysis, scan, start, vertices, dense, config, near=schedule == "warm", cloth=cloth
+    )
     return FrameRegistration(vertices, schedule, first + second)
 
 
@@ -181,6 +194,7 @@ def _dense_stage(
     config: RegistrationConfig,
     *,
     near: bool,
+    cloth: Sequence[ClothColours],
 ) -> tuple[np.ndarray, int]:
     count = len(vertices)
     every = np.arange(count)
@@ -196,8 +210,9 @@ def _dense_stage(
         lengths = folded_lengths(
             scan.surface, vertices, analysis.faces, analysis.edges, analysis.edge_faces, analysis.rest_lengths
         )
-    for step in range(schedule.steps):
-        at = (step, schedule.steps)
+    pull = ColourPull(cloth, scan, config.colour) if cloth and scan.colours is not None and schedule.steps else None
+    for step in range(schedule.steps + (0 if pull is None else config.colour.steps)):
+        at = (min(step, schedule.steps - 1), schedule.steps)
         gate = anneal(schedule.gate, *at)
         terms = [_data_term(analysis, analysis.vertex_rows, scan.surface, vertices, every, gate, config)]
         terms += _border_terms(
@@ -216,6 +231,8 @@ def _dense_stage(
         if anchor > 0.0:
             weights, normals = np.full(count, anchor / count), mesh_normals(vertices, analysis.faces)
             terms.append(RowTerm(analysis.vertex_rows, tangential_metric(normals, weights), vertices - start))
+        if pull is not None:
+            terms.append(pull.term(analysis, vertices, step))
         change, used = gauss_newton_step(
             terms, None, count, damping=1e-6,
             tolerance=config.solver.tolerance, max_iterations=config.solver.max_iterations,
@@ -223,6 +240,23 @@ def _dense_stage(
         vertices = vertices + change[:, :, 0]
         iterations += used
     return vertices, iterations
+
+
+class ColourPull:
+    """What is printed on a scan, through the steps of a dense stage."""
+
+    def __init__(self, cloth: Sequence[ClothColours], scan: FrameScan, config: ColourConfig) -> None:
+        self._cloth, self._scan, self._config = cloth, scan, config
+        self._seen: SeenColours | None = None
+
+    def term(self, analysis: TemplateAnalysis, vertices: np.ndarray, step: int) -> RowTerm:
+        """Colours are looked up anew where their blur changes, and at the end; else their gradients tell."""
+        config, surface, colours = self._config, self._scan.surface, self._scan.colours
+        cloth = self._cloth[0 if step < config.wide_steps else -1]
+        assert colours is not None
+        if self._seen is None or step in config.look_up:
+            self._seen = see_colours(surface, colours, cloth.samples, vertices, cloth.reach)
+        return colour_term(analysis, cloth, self._seen, vertices, weight=config.weight, robust=config.robust)
 
 
 def _data_term(
