@@ -180,7 +180,7 @@ class SynthConfig:
     """What is printed on the cloth: random blobs of all colours but the paint's, stripes, checks, or a logo on the
     chest. Nothing if absent."""
     print_mm: Positive | None = None
-    """Size of the print's features, millimetres: of blobs, stripes, squares, and of the logo's details; 10 if absent."""
+    """Size of the print's features, millimetres: blobs, stripes, squares, details of the logo; 10 if absent."""
     motion: MotionConfig = field(default_factory=MotionConfig)
     simulation: SimulationConfig = field(default_factory=SimulationConfig)
     relaxation: RelaxationConfig = field(default_factory=RelaxationConfig)

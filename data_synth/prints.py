@@ -1,7 +1,7 @@
 """Printed fabric: images over a sewing pattern, with features of a known size, and none of the border paint's colour.
 
-A print is ink on white cloth in the plane of the pattern, at a millimetre a pixel. It is drawn on the whole sheet before
-the panels are cut, so that stripes run along the grain of every panel.
+A print is ink on white cloth in the plane of the pattern, at a millimetre a pixel. It is drawn on the whole sheet: the
+panels are cut afterwards, so that stripes run along the grain of every panel.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ def _blobs(shape: tuple[int, int], feature_px: float, rng: np.random.Generator) 
 
 
 def _unlike(image: np.ndarray, paint: Colour) -> np.ndarray:
-    """The image with what resembles the paint mixed with grey: whoever prints a garment chooses another paint for it."""
+    """The image, what resembles the paint mixed with grey: who prints a garment chooses another paint for it."""
     wanted = nearly_linear(np.array(paint) / 255)
     wanted /= np.linalg.norm(wanted)
     light = nearly_linear(np.clip(image, 0, 1))

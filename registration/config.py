@@ -24,8 +24,8 @@ __all__ = [
     "PRESETS",
     "SOFT",
     "BoundaryConfig",
-    "ColourConfig",
     "CoarseConfig",
+    "ColourConfig",
     "DataConfig",
     "DenseConfig",
     "GraphConfig",
@@ -105,16 +105,22 @@ class BoundaryConfig:
 class ColourConfig:
     """What is printed on the cloth, in the dense stage: it shows how the cloth slides."""
 
+    use: Literal["auto", "off"] = "auto"
+    """auto: where the cloth is printed, which the scans tell; off: never."""
+    print: str | None = None
+    """Picture of the print over the template's UVs: over 0 to 1 where they lie within, else over their bounding box. If
+    absent, the print is learned from the first frames."""
     weight: NonNegative = 2.0
     """Where the colours are as steep as usual, beside 1 of the distance to the scan's planes."""
     robust: Positive = 0.3
     """Scale of the Geman-McClure weight, as a share of the colours' variance."""
-    steps: Whole = 3
+    steps: Whole = 2
     """Gauss-Newton steps that follow those of the dense stage, with its last weights."""
-    wide_steps: Whole = 3
-    """Steps on colours that are blurred widely, before those on sharper ones."""
-    look_up: tuple[Whole, ...] = (0, 3, 5)
-    """Steps."""
+    sharp_steps: Count = 2
+    """Last steps, on colours that are blurred narrowly; those before them are on widely blurred ones."""
+    stretch: NonNegative = 0.6
+    """Least weight of edge lengths: cloth that is held by its colours does not creep where its lengths are wrong, and
+    between them the lengths say where it is."""
 
 
 @settings
@@ -245,6 +251,7 @@ PAPER = RegistrationConfig(
     coarse=CoarseConfig(cold=PAPER_SCHEDULE, warm=PAPER_SCHEDULE),
     dense=DenseConfig(cold=NO_STEPS, warm=NO_STEPS),
     sequence=SequenceConfig(start="skinned", relax=0.0),
+    colour=ColourConfig(use="off"),
 )
 
 """DeepWrinkles as printed: constant weights, no dense stage."""

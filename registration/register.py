@@ -5,7 +5,6 @@ References: DeepWrinkles (ECCV 2018), section 3.1, Eq. 1-2; the dense stage and 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -15,8 +14,9 @@ from jaxtyping import Float, Float64
 from capture4d.errors import InputError
 from capture4d.types import GarmentScan
 from registration.boundary import BorderTargets, border_targets, tangent_free_metric
-from registration.colour_term import ClothColours, SeenColours, colour_term, log_colours, see_colours
-from registration.config import BoundaryRule, ColourConfig, RegistrationConfig, Schedule
+from registration.cloth_colours import log_colours
+from registration.colour_term import ColourPull
+from registration.config import BoundaryRule, RegistrationConfig, Schedule
 from registration.correspondences import (
     Gates,
     ScanSurface,
@@ -62,13 +62,9 @@ class FrameRegistration:
     """Conjugate gradient iterations over all steps."""
 
 
-def prepare_frame(
-    analysis: TemplateAnalysis, scan: GarmentScan, config: RegistrationConfig, *, coloured: bool = False
-) -> FrameScan:
+def prepare_frame(analysis: TemplateAnalysis, scan: GarmentScan, config: RegistrationConfig) -> FrameScan:
     """Smooth the scan, take its normals, sort its points into cells, thin its border points.
 
-    Args:
-        coloured: make its colours ready too, if it has any.
     Raises:
         UnknownBorderError: a paint is named after a loop that the template lacks.
         InputError: the garment scan is empty.
@@ -76,7 +72,7 @@ def prepare_frame(
     if not len(scan.mesh.faces):
         raise InputError(f"frame {scan.frame_id}: expected a garment scan with faces, found none")
     surface = prepare_scan(scan.mesh.vertices, scan.mesh.faces, smoothing_passes=config.data.smoothing_passes)
-    colours = None if scan.colours is None or not coloured else log_colours(surface.of_points(scan.colours))
+    colours = None if scan.colours is None or not analysis.cloth else log_colours(surface.of_points(scan.colours))
     told = np.unique(scan.boundary_loops[scan.boundary_loops >= 0])
     require_borders(analysis.border, [scan.loop_names[loop] for loop in told])
     stride = max(1, -(-len(scan.boundary_points) // config.boundary.max_points))
@@ -94,12 +90,10 @@ def register_frame(
     *,
     config: RegistrationConfig,
     schedule: Literal["cold", "warm"] = "cold",
-    cloth: Sequence[ClothColours] = (),
 ) -> FrameRegistration:
     """Deform the template onto one scan by non-rigid ICP.
 
     Args:
-        cloth: colours of the template, the most blurred first; with them those of the scan take part.
         initial_vertices: start of the search, metres, world frame: the skinned template, or the predicted frame.
         schedule: cold from a distant start, warm from the frame before.
     Raises:
@@ -113,9 +107,7 @@ def register_frame(
     coarse = config.coarse.cold if schedule == "cold" else config.coarse.warm
     dense = config.dense.cold if schedule == "cold" else config.dense.warm
     vertices, first = _coarse_stage(analysis, scan, start, coarse, config, near=schedule == "warm")
-    vertices, second = _dense_stage(
-        analysis, scan, start, vertices, dense, config, near=schedule == "warm", cloth=cloth
-    )
+    vertices, second = _dense_stage(analysis, scan, start, vertices, dense, config, near=schedule == "warm")
     return FrameRegistration(vertices, schedule, first + second)
 
 
@@ -194,7 +186,6 @@ def _dense_stage(
     config: RegistrationConfig,
     *,
     near: bool,
-    cloth: Sequence[ClothColours],
 ) -> tuple[np.ndarray, int]:
     count = len(vertices)
     every = np.arange(count)
@@ -210,8 +201,11 @@ def _dense_stage(
         lengths = folded_lengths(
             scan.surface, vertices, analysis.faces, analysis.edges, analysis.edge_faces, analysis.rest_lengths
         )
-    pull = ColourPull(cloth, scan, config.colour) if cloth and scan.colours is not None and schedule.steps else None
-    for step in range(schedule.steps + (0 if pull is None else config.colour.steps)):
+    pull, steps, lengths_weight = None, schedule.steps, schedule.stretch
+    if steps and scan.colours is not None:
+        pull, steps = ColourPull(analysis, scan.surface, scan.colours, config.colour), steps + config.colour.steps
+        lengths_weight = (lengths_weight[0], max(lengths_weight[1], config.colour.stretch))
+    for step in range(steps):
         at = (min(step, schedule.steps - 1), schedule.steps)
         gate = anneal(schedule.gate, *at)
         terms = [_data_term(analysis, analysis.vertex_rows, scan.surface, vertices, every, gate, config)]
@@ -221,7 +215,7 @@ def _dense_stage(
         )  # fmt: skip
         stretch, excess = stretch_metric(
             edge_vectors(vertices, analysis.edges), lengths,
-            weight=anneal(schedule.stretch, *at), compression=config.dense.compression,
+            weight=anneal(lengths_weight, *at), compression=config.dense.compression,
         )  # fmt: skip
         terms.append(RowTerm(analysis.edge_rows, stretch, excess))
         bending = analysis.laplacian_rows.apply(vertices[:, :, None]) - reference
@@ -232,7 +226,7 @@ def _dense_stage(
             weights, normals = np.full(count, anchor / count), mesh_normals(vertices, analysis.faces)
             terms.append(RowTerm(analysis.vertex_rows, tangential_metric(normals, weights), vertices - start))
         if pull is not None:
-            terms.append(pull.term(analysis, vertices, step))
+            terms.append(pull.term(vertices, step, steps))
         change, used = gauss_newton_step(
             terms, None, count, damping=1e-6,
             tolerance=config.solver.tolerance, max_iterations=config.solver.max_iterations,
@@ -240,23 +234,6 @@ def _dense_stage(
         vertices = vertices + change[:, :, 0]
         iterations += used
     return vertices, iterations
-
-
-class ColourPull:
-    """What is printed on a scan, through the steps of a dense stage."""
-
-    def __init__(self, cloth: Sequence[ClothColours], scan: FrameScan, config: ColourConfig) -> None:
-        self._cloth, self._scan, self._config = cloth, scan, config
-        self._seen: SeenColours | None = None
-
-    def term(self, analysis: TemplateAnalysis, vertices: np.ndarray, step: int) -> RowTerm:
-        """Colours are looked up anew where their blur changes, and at the end; else their gradients tell."""
-        config, surface, colours = self._config, self._scan.surface, self._scan.colours
-        cloth = self._cloth[0 if step < config.wide_steps else -1]
-        assert colours is not None
-        if self._seen is None or step in config.look_up:
-            self._seen = see_colours(surface, colours, cloth.samples, vertices, cloth.reach)
-        return colour_term(analysis, cloth, self._seen, vertices, weight=config.weight, robust=config.robust)
 
 
 def _data_term(

@@ -2,6 +2,7 @@
 
 stage.json                what was run
 garment.npz               the template
+print.npz                 what is printed on it, where anything is (`print_stage`); not made where colours are off
 frames/000123.npz         vertices (V, 3) float32, verdict (0 good, 1 check, 2 failed), and per vertex (V,) residual_m,
                           border_error_m, stretch float32 and flipped bool, as in `FrameQuality`
 metrics/000123.json       the frame's numbers, reasons and CPU time
@@ -16,8 +17,8 @@ come out otherwise.
 from __future__ import annotations
 
 import hashlib
-from dataclasses import asdict, dataclass
-from functools import partial
+from dataclasses import asdict, dataclass, replace
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +49,8 @@ from capture4d.runs.workers import run_jobs, shared
 from capture4d.types import Body, Garment, PoseSequence
 from registration.config import RegistrationConfig
 from registration.predictions import Mover, bend_deg
+from registration.print_stage import made_print, print_inputs, settings_with_print
+from registration.prints import load_print
 from registration.sequence import FrameResult, register_run, segments
 from registration.template import TemplateAnalysis, analyse_template
 
@@ -93,10 +96,22 @@ def run(
     path = output / "garment.npz"
     stage.make_unless_standing(path, lambda: save_garment(path, garment), inputs={"garment": _garment_digest(garment)})
     chain = _chain(capture, stage.ledger, garments, config, (garment, moving), body_folder)
+
+    @cache
+    def opened() -> tuple[TemplateAnalysis, Mover | None]:
+        analysis = analyse_template(garment, config)
+        return analysis, None if moving is None else Mover.create(analysis, *moving)
+
+    printed: list[Path] = []
+    if config.colour.use == "auto":
+        made_from = print_inputs(config.colour, chain.settings, chain.garments, chain.poses, capture.fps)
+        printed = made_print(stage, made_from, garment_folder, (capture.frame_ids, capture.fps), config, opened)
+        chain = replace(chain, settings=settings_with_print(chain.settings, stage.ledger))
     jobs = [each for each in chain.segments if chain.first_stale(each) is not None]
     if jobs:
-        analysis = analyse_template(garment, config)
-        mover = None if moving is None else Mover.create(analysis, *moving)
+        analysis, mover = opened()
+        if printed:
+            analysis = replace(analysis, cloth=load_print(printed[0], analysis))
         take = _Take(analysis, mover, config, garment_folder, stage, chain)
         for _ in run_jobs(
             _register_segment, jobs, prepare=shared(take), workers=workers, label="register", units=len,
@@ -107,7 +122,7 @@ def run(
     paths = [stage.frame_path(frame_id) for frame_id in capture.frame_ids]
     _gather(stage, capture.frame_ids, stage.digest_of_all(paths))
     return stage.finish_growing(
-        [path, output / "vertices.npy", *paths],
+        [path, output / "vertices.npy", *paths, *printed],
         frames=len(paths),
         failed={
             record["frame_id"]: "; ".join(record["reasons"])
@@ -133,6 +148,7 @@ def changes(
             return Pending(capture.frame_ids)
         moving = _moving(capture, body_folder)
         chain = _chain(capture, ledger, garments, config, (_shaped(capture, moving), moving), body_folder)
+        chain = replace(chain, settings=settings_with_print(chain.settings, ledger))
         certain, following = set[int](), set[int]()
         for positions in chain.segments:
             first = chain.first_stale(positions)

@@ -13,6 +13,7 @@ from capture4d.captures.names import unknown_borders
 from capture4d.errors import InputError
 from capture4d.geometry.mesh import edge_uses, edges_of_faces, unique_edges
 from capture4d.types import Garment
+from registration.cloth_colours import ClothColours
 from registration.config import RegistrationConfig
 from registration.deformation_graph import DeformationGraph, build_graph
 from registration.fold_lengths import edge_faces
@@ -63,6 +64,8 @@ class TemplateAnalysis:
     """Faces around vertex v: fan_faces[fan_offsets[v] : fan_offsets[v + 1]]."""
     laplacian_rows: Rows
     """Each vertex minus the mean of its neighbours; along the border, of its neighbours on the border."""
+    cloth: tuple[ClothColours, ...] = ()
+    """Its colours, the most blurred first; none where those of the scans do not take part."""
 
 
 def analyse_template(garment: Garment, config: RegistrationConfig) -> TemplateAnalysis:

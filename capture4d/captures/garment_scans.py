@@ -50,7 +50,7 @@ def load_garment_scan(path: Path, frame_id: int) -> GarmentScan:
                 boundary_loops=arrays["boundary_loops"],
                 loop_names=arrays.names("loop_names"),
                 frame_id=frame_id,
-                colours=arrays["colours"] if "colours" in arrays else None,
+                **({"colours": arrays["colours"]} if "colours" in arrays else {}),
             )
         reason = str(arrays["reason"])
     raise InputError(reason)  # of the scan, which it names

@@ -21,7 +21,9 @@ SMALL_SHARE = 0.02
 """Pieces along the paint that have less of the cloth's vertices are torn off it, not pieces of the body."""
 
 
-def label_print(faces: Int32[np.ndarray, "faces 3"], labels: UInt8[np.ndarray, " verts"]) -> UInt8[np.ndarray, " verts"]:
+def label_print(
+    faces: Int32[np.ndarray, "faces 3"], labels: UInt8[np.ndarray, " verts"]
+) -> UInt8[np.ndarray, " verts"]:
     """Labels of a scan of printed cloth: garment between the paint, whatever it was taken for; the rest is other.
 
     Args:

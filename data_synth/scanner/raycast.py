@@ -239,9 +239,7 @@ def _fill_images(
         across, down = x - left, y - top
         for channel in range(3):
             ink = (1 - down) * ((1 - across) * image[top, left, channel] + across * image[top, left + 1, channel])
-            ink += down * (
-                (1 - across) * image[top + 1, left, channel] + across * image[top + 1, left + 1, channel]
-            )
+            ink += down * ((1 - across) * image[top + 1, left, channel] + across * image[top + 1, left + 1, channel])
             colours[row, column, channel] = (
                 first * corners[0, channel] * (1 + share[face, 0] * (ink - 1))
                 + second * corners[1, channel] * (1 + share[face, 1] * (ink - 1))
