@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import assert_never
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, Float64, UInt8
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from capture4d.colours.spaces import Colour, nearly_encoded, nearly_linear
@@ -17,7 +17,7 @@ from data_synth.cloth.patterns import PanelMesh
 from data_synth.outfits import Outfit, PrintName
 from data_synth.scanner.raycast import Print
 
-__all__ = ["FEATURE_MM", "draw_print", "picture_over", "printed_cloth"]
+__all__ = ["draw_print", "logo_circle", "picture_over", "printed_cloth"]
 
 FEATURE_MM = 10.0
 """Size of the features where none is given."""
@@ -54,9 +54,7 @@ def printed_cloth(
     corner = mesh.uv.reshape(-1, 2)
     origin = (corner.min(axis=0) - MARGIN_M).astype(np.float32)
     columns, rows = np.ceil((corner.max(axis=0) + MARGIN_M - origin) / PIXEL_M).astype(int)
-    front = mesh.uv[mesh.face_panels == 0].reshape(-1, 2)
-    low, high = front.min(axis=0), front.max(axis=0)
-    chest = np.array([(low[0] + high[0]) / 2, low[1] + CHEST * (high[1] - low[1])])
+    chest, _ = logo_circle(mesh, feature_mm)
     image = draw_print(
         name, (rows, columns), outfit,
         feature_px=(feature_mm or FEATURE_MM) / (1000 * PIXEL_M), chest_px=(chest - origin) / PIXEL_M,
@@ -81,6 +79,14 @@ def picture_over(
     places = np.meshgrid((v - origin[1]) / PIXEL_M, (u - origin[0]) / PIXEL_M, indexing="ij")
     channels = [map_coordinates(found.image[..., c], places, order=1, mode="nearest") for c in range(3)]
     return np.clip(np.rint(255 * np.stack(channels, axis=-1)), 0, 255).astype(np.uint8)
+
+
+def logo_circle(mesh: PanelMesh, feature_mm: float | None) -> tuple[Float64[np.ndarray, " 2"], float]:
+    """Middle (u, v) and radius of a logo on the front panel of a pattern, metres."""
+    front = mesh.uv[mesh.face_panels == 0].reshape(-1, 2)
+    low, high = front.min(axis=0), front.max(axis=0)
+    middle = np.array([(low[0] + high[0]) / 2, low[1] + CHEST * (high[1] - low[1])])
+    return middle, LOGO_FEATURES * (feature_mm or FEATURE_MM) / 2000
 
 
 def draw_print(

@@ -6,6 +6,7 @@ picture. Frames are made anew where it comes out otherwise. Of plain cloth the f
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -74,7 +75,7 @@ def made_print(
     path, (frame_ids, fps) = stage.path / PRINT, frames
     made = stage.ledger.of(path)
     if made is None or not stage.stands(path, inputs):
-        analysis, mover = opened()
+        begin, (analysis, mover) = time.process_time(), opened()
         cloth: tuple[ClothColours, ...]
         if config.colour.print is not None:
             cloth, contrast = print_of_picture(analysis, read_picture(Path(config.colour.print))), np.nan
@@ -85,7 +86,8 @@ def made_print(
                 load=lambda frame_id: load_garment_scan(frame_file(garments, frame_id), frame_id),
             )  # fmt: skip
             _say_print(stage, bool(cloth), contrast)
-        made = stage.make(path, lambda: save_print(path, cloth, contrast), inputs=inputs, said={"printed": bool(cloth)})
+        told = {"printed": bool(cloth), "cpu_s": round(time.process_time() - begin, 2)}
+        made = stage.make(path, lambda: save_print(path, cloth, contrast), inputs=inputs, said=told)
     return [path] if made.said.get("printed") else []
 
 
