@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -83,18 +84,19 @@ def printed_take(config: SynthConfig, name: PrintName, print_mm: float | None, *
         config: of a take without scans.
     """
     simulated = read_capture(cached_take(config, workers=workers), scans=False)
-    size = "" if print_mm is None else f"-{print_mm:g}mm"
-    folder = user_cache_folder() / "printed" / f"{simulated.path.name}-{name}{size}"
+    plan = plan_take(replace(config, print=name, print_mm=print_mm))
+    assert plan.paint.print is not None
+    picture = picture_over(plan.paint.print, plan.fine, plan.template.uv)
+    drawn = cv2.imencode(".png", picture[..., ::-1])[1].tobytes()
+    digest = hashlib.sha256(drawn).hexdigest()[:8]
+    folder = user_cache_folder() / "printed" / f"{simulated.path.name}-{name}-{digest}"
     labels = folder / "labels"
     for place in (folder / "scans", labels):
         place.mkdir(parents=True, exist_ok=True)
     for entry in ("body.npz", "poses.npz", "template.npz", "truth"):
         if not (folder / entry).exists():
             (folder / entry).symlink_to(simulated.path / entry)
-    plan = plan_take(replace(config, print=name, print_mm=print_mm))
-    assert plan.paint.print is not None
-    picture = picture_over(plan.paint.print, plan.fine, plan.template.uv)
-    write_bytes(folder / "print.png", cv2.imencode(".png", picture[..., ::-1])[1].tobytes())
+    write_bytes(folder / "print.png", drawn)
     capture = replace(simulated, path=folder, garment_colour=None, files=None)
     missing = [each for each in simulated.frame_ids if not (folder / "scans" / f"{each:06d}.ply").is_file()]
     prepare = partial(_Scanned.open, replace(config, print=name, print_mm=print_mm), simulated, folder)

@@ -26,7 +26,7 @@ MARGIN_M = 0.01
 """Of the image around the pattern."""
 SOFTNESS_M = 0.0008
 """Standard deviation to which ink runs."""
-UNLIKE_PAINT = 0.3
+UNLIKE_PAINT = 0.34
 """Least angle in linear RGB between the print and the paint, radians."""
 LOGO_FEATURES = 14
 """A logo is so many features wide."""
@@ -53,7 +53,7 @@ def printed_cloth(
     """
     corner = mesh.uv.reshape(-1, 2)
     origin = (corner.min(axis=0) - MARGIN_M).astype(np.float32)
-    columns, rows = np.ceil((corner.max(axis=0) + MARGIN_M - origin) / PIXEL_M).astype(int)
+    columns, rows = np.ceil((corner.max(axis=0) + MARGIN_M - origin) / PIXEL_M).astype(int).tolist()
     chest, _ = logo_circle(mesh, feature_mm)
     image = draw_print(
         name, (rows, columns), outfit,

@@ -96,7 +96,7 @@ class ClothColours:
     """Variance of the colours where they change, about their mean over a hand's breadth."""
 
 
-def log_colours(colours: UInt8[np.ndarray, "points 3"]) -> Float64[np.ndarray, "points 3"]:
+def log_colours(colours: UInt8[np.ndarray, "*any 3"]) -> Float64[np.ndarray, "*any 3"]:
     """Logarithms of sRGB: light scales linear colours, and adds to these."""
     return np.log(np.maximum(np.arange(256), DARKEST) / 255.0)[colours]
 

@@ -108,8 +108,8 @@ class ColourConfig:
     use: Literal["auto", "off"] = "auto"
     """auto: where the cloth is printed, which the scans tell; off: never."""
     print: str | None = None
-    """Picture of the print over the template's UVs: over 0 to 1 where they lie within, else over their bounding box. If
-    absent, the print is learned from the first frames."""
+    """Picture of the print over the template's UVs: over 0 to 1, as textures lie; over the bounding box of UVs that are
+    a pattern in metres, or reach beyond. If absent, the print is learned from the first frames."""
     weight: NonNegative = 2.0
     """Where the colours are as steep as usual, beside 1 of the distance to the scan's planes."""
     robust: Positive = 0.3

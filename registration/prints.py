@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 from scipy.ndimage import gaussian_filter, map_coordinates
 
+from capture4d.body.sewing_pattern import with_known_pattern
 from capture4d.errors import InputError
 from capture4d.files.arrays import ArrayFile
 from capture4d.files.atomic import write_npz
@@ -131,7 +132,8 @@ def print_contrast(analysis: TemplateAnalysis, cloth: ClothColours, vertices: Fl
 def print_of_picture(
     analysis: TemplateAnalysis, picture: UInt8[np.ndarray, "rows columns 3"]
 ) -> tuple[ClothColours, ...]:
-    """The template's colours as a picture over its UVs has them: over 0 to 1, or over their bounding box.
+    """The template's colours as a picture over its UVs has them: over 0 to 1, as textures lie, or over the bounding box
+    of UVs that are a pattern in metres, or reach beyond.
 
     Raises:
         InputError: the template has no UVs.
@@ -140,7 +142,7 @@ def print_of_picture(
     if uv is None:
         raise InputError("template: expected UVs under the picture of its print, found none")
     low, high = uv.reshape(-1, 2).min(axis=0).astype(np.float64), uv.reshape(-1, 2).max(axis=0).astype(np.float64)
-    if low.min() >= 0 and high.max() <= 1:
+    if with_known_pattern(analysis.garment).pattern_metres != 1 and low.min() >= 0 and high.max() <= 1:
         low, high = np.zeros(2), np.ones(2)
     corners = uv.astype(np.float64)
     lengths = np.linalg.norm(corners - corners[:, [1, 2, 0]], axis=2)

@@ -47,7 +47,7 @@ class FrameScan:
     border_loops: np.ndarray
     """(points,) int32: index of the template's loop, or -1 where the paint does not tell."""
     frame_id: int
-    colours: Float64[np.ndarray, "points 3"] | None = None
+    colours: Float64[np.ndarray, "surface_points 3"] | None = None
     """Logarithms of the surface's colours; None where they are not to be compared."""
 
 
