@@ -25,6 +25,7 @@ from capture4d.files.arrays import ArrayFile
 from capture4d.files.atomic import write_npz
 from capture4d.geometry.point_grid import PointGrid
 from capture4d.types import GarmentScan
+from capture4d.value_checks import require_array, require_finite
 from registration.cloth_colours import ClothColours, ColourSamples, log_colours, sample_faces, see_colours
 from registration.colour_term import without_light
 from registration.config import RegistrationConfig, Schedule
@@ -175,15 +176,22 @@ def save_print(path: Path, cloth: Sequence[ClothColours], contrast: float) -> No
 
 
 def load_print(path: Path, analysis: TemplateAnalysis) -> tuple[ClothColours, ...]:
-    """The colours of a template that were written for it."""
+    """The colours of a template that were written for it.
+
+    Raises:
+        InputError: the file is damaged, or was written for another template.
+    """
     found = []
     with ArrayFile(path, kind="print") as arrays:
         if not int(arrays["levels"]):
             return ()
         for level, samples in enumerate(_samples(analysis)):
             reach, steepness, spread = arrays[f"scales_{level}"].tolist()
-            values = arrays[f"values_{level}"].astype(np.float64)
-            found.append(ClothColours(samples, reach, values, arrays[f"known_{level}"], steepness, spread))
+            values, known = arrays[f"values_{level}"], arrays[f"known_{level}"]
+            require_array("print", "values", values, (len(samples), 3), np.float32)
+            require_array("print", "known", known, (len(samples),), np.bool_)
+            require_finite("print", "values", values)
+            found.append(ClothColours(samples, reach, values.astype(np.float64), known, steepness, spread))
     return tuple(found)
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from capture4d.errors import InputError
 from capture4d.types import Garment, GarmentScan, Mesh
 from registration.config import RegistrationConfig
 from registration.prints import (
@@ -168,6 +169,8 @@ def test_a_print_is_the_same_after_it_was_written(template, printed, tmp_path) -
     for again, first in zip(load_print(tmp_path / "print.npz", template), printed.cloth, strict=True):
         np.testing.assert_allclose(again.values, first.values, atol=1e-6)
         assert (again.steepness, again.spread, again.reach) == (first.steepness, first.spread, first.reach)
+    with pytest.raises(InputError, match="values"):
+        load_print(tmp_path / "print.npz", analyse_template(Garment(tube(20, 8)), RegistrationConfig()))
     save_print(tmp_path / "plain.npz", (), 0.1)
     assert load_print(tmp_path / "plain.npz", template) == ()
 
