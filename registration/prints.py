@@ -82,7 +82,7 @@ def learn_print(
     ):
         if result.quality.verdict == "failed":
             continue
-        scan = coloured_frame(analysis, load(result.frame_id), config)
+        scan = _coloured_frame(analysis, load(result.frame_id), config)
         if scan.colours is None:
             break
         found.append((scan, result.vertices.astype(np.float64)))
@@ -108,7 +108,7 @@ def learn_print(
     return cloth, contrast
 
 
-def coloured_frame(analysis: TemplateAnalysis, scan: GarmentScan, config: RegistrationConfig) -> FrameScan:
+def _coloured_frame(analysis: TemplateAnalysis, scan: GarmentScan, config: RegistrationConfig) -> FrameScan:
     """A frame with its colours, though those of the template are not known."""
     frame = prepare_frame(analysis, scan, config)
     return frame if scan.colours is None else replace(frame, colours=log_colours(frame.surface.of_points(scan.colours)))
