@@ -39,6 +39,10 @@ __all__ = ["learn_print", "learning_positions", "load_print", "print_contrast", 
 LEVELS = ((0.014, 0.022), (0.007, 0.0065))
 """Distance between samples, and reach of the blur, metres: wide, then narrow. A print with features of 10 mm is found
 from 8 mm away, and to half a millimetre (`python -m benchmarks registration --data printed`)."""
+LESS_WIDE = (0.015, 0.01)
+"""Reaches of the wide blur for prints that are too fine to be seen under it, such as stripes."""
+SEEN_SHARE = 0.2
+"""Of the narrowly blurred colours' variance, that is left under a wide blur that sees the print."""
 LEAST_SPACINGS = 2.5
 """No blur reaches less far than so many sample spacings of the scan."""
 BLUR_OF_REACH = 0.354
@@ -76,7 +80,7 @@ def learn_print(
         load: the garment scan of a frame.
     """
     found: list[tuple[FrameScan, np.ndarray]] = []
-    samples, contrast = _samples(analysis), float("nan")
+    samples, contrast, reaches = _samples(analysis), float("nan"), tuple(reach for _, reach in LEVELS)
     for result in register_run(
         analysis, mover, positions, frame_ids, load=load, done=lambda position, before: None, config=config
     ):
@@ -87,7 +91,8 @@ def learn_print(
             break
         found.append((scan, result.vertices.astype(np.float64)))
         if len(found) == 1:
-            first = _average(analysis, samples, found, None)
+            reaches = _reaches(lambda tried: _average(analysis, samples, found, None, tried))
+            first = _average(analysis, samples, found, None, reaches)
             contrast = print_contrast(analysis, first[-1], found[0][1])
             if contrast < CONTRAST:
                 break
@@ -95,7 +100,7 @@ def learn_print(
         return (), contrast
     chosen = np.unique(np.linspace(0, len(found) - 1, min(AVERAGED, len(found))).round().astype(int))
     frames = [found[row] for row in chosen]
-    cloth = _average(analysis, samples, frames, None)
+    cloth = _average(analysis, samples, frames, None, reaches)
     still = replace(config.coarse, warm=replace(config.coarse.warm, steps=0))
     held = replace(config, coarse=still, dense=replace(config.dense, warm=HELD))
     for _ in range(ROUNDS):
@@ -104,7 +109,7 @@ def learn_print(
             (scan, register_frame(printed, scan, vertices, config=held, schedule="warm").vertices)
             for scan, vertices in frames
         ]
-        cloth = _average(analysis, samples, frames, cloth)
+        cloth = _average(analysis, samples, frames, cloth, reaches)
     return cloth, contrast
 
 
@@ -150,20 +155,24 @@ def print_of_picture(
     edges = analysis.rest[analysis.faces]
     metres = float((np.linalg.norm(edges - edges[:, [1, 2, 0]], axis=2) / np.maximum(lengths, 1e-12)).mean())
     pixels = np.array(picture.shape[:2])[::-1] / (metres * (high - low))  # a metre, along u and v
-    found = []
-    for samples, (_, reach) in zip(_samples(analysis), LEVELS, strict=True):
-        places = (samples.of_corners(corners) - low) / (high - low)
-        across, down = BLUR_OF_REACH * reach * pixels
-        logarithms = gaussian_filter(log_colours(picture), (down, across, 0))
-        values = _between_pixels(logarithms, places)
-        step = 0.25 * reach / (metres * (high - low))
-        steep = [
-            (_between_pixels(logarithms, places + side) - _between_pixels(logarithms, places - side)) / (0.5 * reach)
-            for side in np.diag(step)
-        ]
-        gradients = np.stack([*steep, np.zeros_like(values)], axis=-1)
-        found.append(_cloth(analysis, samples, reach, values, samples.inner, gradients))
-    return tuple(found)
+    levels, logarithms = _samples(analysis), log_colours(picture)
+
+    def coloured(reaches: Sequence[float]) -> tuple[ClothColours, ...]:
+        found = []
+        for samples, reach in zip(levels, reaches, strict=True):
+            places = (samples.of_corners(corners) - low) / (high - low)
+            across, down = BLUR_OF_REACH * reach * pixels
+            blurred = gaussian_filter(logarithms, (down, across, 0))
+            values, step = _between_pixels(blurred, places), 0.25 * reach / (metres * (high - low))
+            steep = [
+                (_between_pixels(blurred, places + side) - _between_pixels(blurred, places - side)) / (0.5 * reach)
+                for side in np.diag(step)
+            ]
+            gradients = np.stack([*steep, np.zeros_like(values)], axis=-1)
+            found.append(_cloth(analysis, samples, reach, values, samples.inner, gradients))
+        return tuple(found)
+
+    return coloured(_reaches(coloured))
 
 
 def save_print(path: Path, cloth: Sequence[ClothColours], contrast: float) -> None:
@@ -206,17 +215,32 @@ def _samples(analysis: TemplateAnalysis) -> list[ColourSamples]:
     return [sample_faces(analysis.faces, max(1, round(edge / spacing)), aside) for spacing, _ in LEVELS]
 
 
+def _reaches(coloured: Callable[[Sequence[float]], Sequence[ClothColours]]) -> tuple[float, float]:
+    """Of the wide and the narrow blur: the widest that still sees the print, else the narrow one twice.
+
+    Args:
+        coloured: the cloth's colours under given blurs.
+    """
+    narrow = LEVELS[-1][1]
+    for wide in (LEVELS[0][1], *LESS_WIDE):
+        found = coloured((wide, narrow))
+        if found[0].spread >= SEEN_SHARE * found[-1].spread:
+            return wide, narrow
+    return narrow, narrow
+
+
 def _average(
     analysis: TemplateAnalysis,
     levels: Sequence[ColourSamples],
     frames: Sequence[tuple[FrameScan, np.ndarray]],
     before: Sequence[ClothColours] | None,
+    reaches: Sequence[float],
 ) -> tuple[ClothColours, ...]:
     """Mean colours of the frames, each in the light of the colours before, or else of the first."""
     found = []
     spacing = float(np.mean([scan.surface.spacing for scan, _ in frames]))
     for level, samples in enumerate(levels):
-        reach = max(LEVELS[level][1], LEAST_SPACINGS * spacing)
+        reach = max(reaches[level], LEAST_SPACINGS * spacing)
         total, count = np.zeros((len(samples), 3)), np.zeros(len(samples))
         light, steep = None if before is None else (before[level].values, before[level].known), np.zeros(())
         for scan, vertices in frames:
