@@ -30,5 +30,8 @@ def cached_training_set(config: TrainingSetConfig, *, workers: int = 2) -> Path:
 
 
 def _folder(config: SynthConfig | TrainingSetConfig, schema: int) -> Path:
-    key = hashlib.sha256(json.dumps([schema, asdict(config)], sort_keys=True).encode()).hexdigest()[:12]
+    known = json.dumps([schema, asdict(config)], sort_keys=True)
+    for later in ("print", "print_mm"):  # takes were made, and are kept, before there were prints
+        known = known.replace(f', "{later}": null', "")
+    key = hashlib.sha256(known.encode()).hexdigest()[:12]
     return user_cache_folder() / "takes" / f"{config.name}-{key}"

@@ -13,7 +13,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 from rich.console import Console
@@ -120,7 +119,7 @@ def run(*, quick: bool = False, frames: int = 3, workers: int = 2) -> list[Metri
 
 def _cases(scanner: ScannerConfig) -> Iterator[_Case]:
     """All lights with the depth scanner; with the stereo scanner, whose scans are slow, each outfit in one."""
-    lights = get_args(Lighting)
+    lights: tuple[Lighting, ...] = ("even", "side", "two-temperature")
     for index, outfit in enumerate(OUTFITS_MEASURED):
         for lighting in lights:
             yield _Case(outfit, replace(scanner, shading=ShadingConfig(lighting=lighting)))

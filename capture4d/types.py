@@ -169,8 +169,12 @@ class GarmentScan:
     """Index into `loop_names` for each boundary point, or -1 where the paint does not tell the loops apart."""
     loop_names: tuple[str, ...]
     frame_id: int
+    colours: UInt8[np.ndarray, "verts 3"] | None = None
+    """sRGB per vertex, as scanned; None where nobody has kept them."""
 
     def __post_init__(self) -> None:
+        if self.colours is not None:
+            require_array("GarmentScan", "colours", self.colours, (len(self.mesh.vertices), 3), np.uint8)
         require_array("GarmentScan", "boundary_points", self.boundary_points, (None, 3), np.float32)
         require_array("GarmentScan", "boundary_loops", self.boundary_loops, (len(self.boundary_points),), np.int32)
         require_finite("GarmentScan", "boundary_points", self.boundary_points)

@@ -6,7 +6,7 @@ from dataclasses import field, replace
 from typing import Annotated, Literal
 
 from capture4d.settings import Count, NonNegative, Number, Positive, Range, Seed, Share, Whole, settings
-from data_synth.outfits import OutfitName
+from data_synth.outfits import OutfitName, PrintName
 from data_synth.scanner.config import FusionConfig, RigConfig, ScannerConfig, StereoConfig
 
 ClipName = Literal[
@@ -176,6 +176,11 @@ class SynthConfig:
     style: GarmentStyle = field(default_factory=GarmentStyle)
     outfit: OutfitName = "blue"
     """Colours of garment, border paint and suit."""
+    print: PrintName | None = None
+    """What is printed on the cloth: random blobs of all colours but the paint's, stripes, checks, or a logo on the
+    chest. Nothing if absent."""
+    print_mm: Positive | None = None
+    """Size of the print's features, millimetres: blobs, stripes, squares, details of the logo; 10 if absent."""
     motion: MotionConfig = field(default_factory=MotionConfig)
     simulation: SimulationConfig = field(default_factory=SimulationConfig)
     relaxation: RelaxationConfig = field(default_factory=RelaxationConfig)

@@ -6,10 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-__all__ = ["OUTFITS", "Outfit", "OutfitName"]
+__all__ = ["OUTFITS", "Outfit", "OutfitName", "PrintName"]
 
 Colour = tuple[int, int, int]
 OutfitName = Literal["blue", "red", "olive"]
+PrintName = Literal["random", "stripes", "checks", "logo"]
 
 
 @dataclass(frozen=True, slots=True)

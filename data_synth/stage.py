@@ -7,13 +7,14 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from capture4d.captures.capture import Capture, write_capture_description, write_scan
 from capture4d.captures.truth import TruthFrame, TruthModel, write_truth_frame, write_truth_model
 from capture4d.errors import InputError
 from capture4d.files.arrays import ArrayFile
-from capture4d.files.atomic import file_digest, read_json, write_json, write_npz
+from capture4d.files.atomic import file_digest, read_json, write_bytes, write_json, write_npz
 from capture4d.files.records import load_rig, save_body, save_garment, save_poses, save_rig
 from capture4d.runs.stage import Stage, StageResult, open_stage
 from capture4d.runs.workers import run_jobs
@@ -23,6 +24,7 @@ from data_synth.cloth.quality import measure_cloth
 from data_synth.cloth.template import bind_template, carry
 from data_synth.config import SynthConfig
 from data_synth.outfits import OUTFITS
+from data_synth.prints import picture_over
 from data_synth.scan_files import pending_scans
 from data_synth.scanner.scan import scan_surfaces
 from data_synth.take import TakePlan, measured_poses, plan_take, simulate_take, take_rig, take_surfaces
@@ -53,6 +55,8 @@ SIMULATED = (
     "truth/model.npz",
 )
 """Files of a take that the simulation writes, besides the cloth."""
+PRINT = "truth/print.png"
+"""What is printed on the garment, over the bounding box of the template's UVs; not there if nothing is."""
 QUALITY = "truth/quality.json"
 
 
@@ -116,7 +120,7 @@ class ScanJob:
 def simulation_jobs(stage: Stage, config: SynthConfig) -> list[SimulationJob]:
     """One, or none if the clip has been simulated. What an interrupted simulation has left is removed."""
     cloth = stage.path / "cloth"
-    lost = [name for name in SIMULATED if not (stage.path / name).is_file()]
+    lost = [name for name in _simulated(config) if not (stage.path / name).is_file()]
     if ((cloth / "complete.json").exists() and not lost) or is_whole(stage, config):
         return []
     shutil.rmtree(cloth, ignore_errors=True)
@@ -135,8 +139,12 @@ def scan_jobs(stage: Stage, config: SynthConfig) -> list[ScanJob]:
 
 def is_whole(stage: Stage, config: SynthConfig) -> bool:
     """Whether every file of the take is there."""
-    wanted = [*SIMULATED, QUALITY]
+    wanted = [*_simulated(config), QUALITY]
     return all((stage.path / name).is_file() for name in wanted) and not _unscanned(stage, config)
+
+
+def _simulated(config: SynthConfig) -> tuple[str, ...]:
+    return SIMULATED if config.print is None else (*SIMULATED, PRINT)
 
 
 def _unscanned(stage: Stage, config: SynthConfig) -> list[int]:
@@ -151,7 +159,7 @@ def finish_take(stage: Stage, config: SynthConfig) -> StageResult:
     """Close the folder of a take whose frames are all there."""
     frame_ids = list(range(1, config.frames + 1))
     _write_quality(stage, frame_ids)
-    files = [stage.path / name for name in (*SIMULATED, QUALITY)]
+    files = [stage.path / name for name in (*_simulated(config), QUALITY)]
     files += [stage.frame_path(frame_id, folder="truth") for frame_id in frame_ids]
     if config.scans:
         files += [stage.frame_path(frame_id, ".ply", folder="scans") for frame_id in frame_ids]
@@ -193,10 +201,13 @@ def simulate_clip(job: SimulationJob) -> None:
             config.name,
             take.poses.fps,
             tuple(int(frame_id) for frame_id in take.poses.frame_ids),
-            outfit.garment,
+            outfit.garment if config.print is None else None,  # no one colour is
             dict.fromkeys(take.pattern.borders, outfit.border),
         )
     )
+    if take.paint.print is not None:
+        picture = picture_over(take.paint.print, take.fine, take.template.uv)
+        write_bytes(folder / PRINT, cv2.imencode(".png", picture[..., ::-1])[1].tobytes())
     write_json(folder / "cloth" / "complete.json", {"frames": config.frames})
 
 

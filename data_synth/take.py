@@ -22,6 +22,8 @@ from data_synth.cloth.wrinkle_relaxation import WrinkleMesh, relax_frame, wrinkl
 from data_synth.config import FABRICS, SynthConfig
 from data_synth.motions import make_motion
 from data_synth.outfits import OUTFITS, Outfit
+from data_synth.prints import printed_cloth
+from data_synth.scanner.raycast import Print
 from data_synth.scanner.rig import bounding_sphere, scanner_rig
 from data_synth.scanner.scan import LABEL_BODY, LABEL_GARMENT, Surface
 
@@ -37,6 +39,9 @@ __all__ = [
     "take_surfaces",
 ]
 
+WHITE = (255, 255, 255)
+PRINT_STREAM = 300
+"""Added to the seed of a take for that of its print."""
 BORDER_BAND_M = 0.009
 """Width of the painted border."""
 RIG_RADIUS_M = 0.58
@@ -52,6 +57,8 @@ class Paint:
     is_border: Bool[np.ndarray, " verts"]
     """Where the fine cloth is painted."""
     body: UInt8[np.ndarray, "body_verts 3"]
+    print: Print | None = None
+    """On the fine cloth, which is white below it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -124,14 +131,23 @@ def plan_take(config: SynthConfig) -> TakePlan:
         fine=meshes["fine"],
         template=meshes["template"],
         wrinkles=wrinkle_mesh(meshes["coarse"], meshes["fine"], config.relaxation, streams["imperfection"]),
-        paint=_paint(OUTFITS[config.outfit], meshes["fine"], shaped),
+        paint=_paint(config, meshes["fine"], shaped),
     )
 
 
-def _paint(outfit: Outfit, fine: PanelMesh, shaped: ShapedBody) -> Paint:
-    is_border = painted_band(fine)
-    garment = np.where(is_border[:, None], outfit.border, outfit.garment).astype(np.uint8)
-    return Paint(garment, is_border, dress_colours(shaped, outfit))
+def _paint(config: SynthConfig, fine: PanelMesh, shaped: ShapedBody) -> Paint:
+    outfit, is_border = OUTFITS[config.outfit], painted_band(fine)
+    cloth = outfit.garment if config.print is None else WHITE
+    garment = np.where(is_border[:, None], outfit.border, cloth).astype(np.uint8)
+    return Paint(garment, is_border, dress_colours(shaped, outfit), _print(config, outfit, fine, is_border))
+
+
+def _print(config: SynthConfig, outfit: Outfit, fine: PanelMesh, is_border: np.ndarray) -> Print | None:
+    if config.print is None:
+        return None
+    return printed_cloth(
+        fine, config.print, outfit, feature_mm=config.print_mm, painted=is_border, seed=config.seed + PRINT_STREAM
+    )
 
 
 def _person(shape: tuple[float, ...]) -> ShapedBody:
@@ -212,6 +228,13 @@ def take_surfaces(take: TakePlan, fine: np.ndarray, surface: np.ndarray) -> list
     fusion, paint = take.config.scanner.fusion, take.paint
     faces = take.shaped.body.template.faces
     return [
-        Surface(Mesh(fine, take.fine.faces), paint.garment, LABEL_GARMENT, fusion.garment_voxel_m, paint.is_border),
+        Surface(
+            Mesh(fine, take.fine.faces),
+            paint.garment,
+            LABEL_GARMENT,
+            fusion.garment_voxel_m,
+            paint.is_border,
+            paint.print,
+        ),
         Surface(Mesh(surface, faces), paint.body, LABEL_BODY, fusion.body_voxel_m),
     ]

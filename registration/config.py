@@ -26,6 +26,7 @@ __all__ = [
     "ApproachConfig",
     "BoundaryConfig",
     "CoarseConfig",
+    "ColourConfig",
     "DataConfig",
     "DenseConfig",
     "GraphConfig",
@@ -100,6 +101,28 @@ class BoundaryConfig:
     """Farthest target, metres."""
     max_points: Count = 3000
     """Scan border points are thinned to this many."""
+
+
+@settings
+class ColourConfig:
+    """What is printed on the cloth, in the dense stage: it shows how the cloth slides."""
+
+    use: Literal["auto", "off"] = "auto"
+    """auto: where the cloth is printed, which the scans tell; off: never."""
+    print: str | None = None
+    """Picture of the print over the template's UVs: over 0 to 1, as textures lie; over the bounding box of UVs that are
+    a pattern in metres, or reach beyond. If absent, the print is learned from the first frames."""
+    weight: NonNegative = 2.0
+    """Where the colours are as steep as usual, beside 1 of the distance to the scan's planes."""
+    robust: Positive = 0.3
+    """Scale of the Geman-McClure weight, as a share of the colours' variance."""
+    steps: Whole = 2
+    """Gauss-Newton steps that follow those of the dense stage, with its last weights."""
+    sharp_steps: Count = 2
+    """Last steps, on colours that are blurred narrowly; those before them are on widely blurred ones."""
+    stretch: NonNegative = 0.6
+    """Least weight of edge lengths: cloth that is held by its colours does not creep where its lengths are wrong, and
+    between them the lengths say where it is."""
 
 
 @settings
@@ -220,6 +243,7 @@ class RegistrationConfig:
     coarse: CoarseConfig = field(default_factory=CoarseConfig)
     dense: DenseConfig = field(default_factory=DenseConfig)
     sequence: SequenceConfig = field(default_factory=SequenceConfig)
+    colour: ColourConfig = field(default_factory=ColourConfig)
     quality: QualityConfig = field(default_factory=QualityConfig)
 
 
@@ -233,6 +257,7 @@ PAPER = RegistrationConfig(
     coarse=CoarseConfig(cold=PAPER_SCHEDULE, warm=PAPER_SCHEDULE),
     dense=DenseConfig(cold=NO_STEPS, warm=NO_STEPS),
     sequence=SequenceConfig(start="skinned", relax=0.0),
+    colour=ColourConfig(use="off"),
 )
 
 """DeepWrinkles as printed: constant weights, no dense stage."""

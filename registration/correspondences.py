@@ -37,6 +37,12 @@ class ScanSurface:
     grid: PointGrid
     spacing: float
     """Mean edge length, metres: what the scan resolves."""
+    used: Bool[np.ndarray, " vertices"] | None = None
+    """The scan's vertices that are its points, those with faces; None if all are."""
+
+    def of_points(self, values: np.ndarray) -> np.ndarray:
+        """Of values of the scan's vertices, those of its points."""
+        return values if self.used is None else values[self.used]
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +93,7 @@ def prepare_scan(
     if not used.all():
         positions, normals = positions[used], normals[used]
     grid = PointGrid.build(positions, CELL_SPACINGS * spacing)
-    return ScanSurface(positions, normals, grid, spacing)
+    return ScanSurface(positions, normals, grid, spacing, None if used.all() else used)
 
 
 def mesh_normals(

@@ -14,6 +14,8 @@ from jaxtyping import Float, Float64
 from capture4d.errors import InputError
 from capture4d.types import GarmentScan
 from registration.boundary import BorderTargets, border_targets, tangent_free_metric
+from registration.cloth_colours import log_colours
+from registration.colour_term import ColourPull
 from registration.config import BoundaryRule, RegistrationConfig, Schedule
 from registration.correspondences import (
     Gates,
@@ -52,6 +54,8 @@ class FrameScan:
     border_loops: np.ndarray
     """(points,) int32: index of the template's loop, or -1 where the paint does not tell."""
     frame_id: int
+    colours: Float64[np.ndarray, "surface_points 3"] | None = None
+    """Logarithms of the surface's colours; None where they are not to be compared."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,6 +79,7 @@ def prepare_frame(analysis: TemplateAnalysis, scan: GarmentScan, config: Registr
     if not len(scan.mesh.faces):
         raise InputError(f"frame {scan.frame_id}: expected a garment scan with faces, found none")
     surface = prepare_scan(scan.mesh.vertices, scan.mesh.faces, smoothing_passes=config.data.smoothing_passes)
+    colours = None if scan.colours is None or not analysis.cloth else log_colours(surface.of_points(scan.colours))
     told = np.unique(scan.boundary_loops[scan.boundary_loops >= 0])
     require_borders(analysis.border, [scan.loop_names[loop] for loop in told])
     stride = max(1, -(-len(scan.boundary_points) // config.boundary.max_points))
@@ -82,7 +87,7 @@ def prepare_frame(analysis: TemplateAnalysis, scan: GarmentScan, config: Registr
     renumbered = np.array([names.get(name, -1) for name in scan.loop_names] + [-1], np.int32)
     loops = renumbered[scan.boundary_loops[::stride]]
     points = scan.boundary_points[::stride].astype(np.float64)
-    return FrameScan(surface, points, loops, scan.frame_id)
+    return FrameScan(surface, points, loops, scan.frame_id, colours)
 
 
 def register_frame(
@@ -199,8 +204,12 @@ def _dense_stage(
         lengths = folded_lengths(
             scan.surface, vertices, analysis.faces, analysis.edges, analysis.edge_faces, analysis.rest_lengths
         )
-    for step in range(schedule.steps):
-        at = (step, schedule.steps)
+    pull, steps, lengths_weight = None, schedule.steps, schedule.stretch
+    if steps and scan.colours is not None:
+        pull, steps = ColourPull(analysis, scan.surface, scan.colours, config.colour), steps + config.colour.steps
+        lengths_weight = (lengths_weight[0], max(lengths_weight[1], config.colour.stretch))
+    for step in range(steps):
+        at = (min(step, schedule.steps - 1), schedule.steps)
         gate = anneal(schedule.gate, *at)
         terms: list[Term] = [_data_term(analysis, analysis.vertex_rows, scan.surface, vertices, every, gate, config)]
         terms += _border_terms(
@@ -210,7 +219,7 @@ def _dense_stage(
         terms.append(
             stretch_term(
                 vertices, analysis.edges, lengths,
-                weight=anneal(schedule.stretch, *at), compression=config.dense.compression,
+                weight=anneal(lengths_weight, *at), compression=config.dense.compression,
             )
         )  # fmt: skip
         bending = analysis.laplacian_rows.apply(vertices[:, :, None]) - reference
@@ -224,6 +233,8 @@ def _dense_stage(
         if anchor > 0.0:
             weights, normals = np.full(count, anchor / count), mesh_normals(vertices, analysis.faces)
             terms.append(RowTerm(analysis.vertex_rows, tangential_metric(normals, weights), vertices - start))
+        if pull is not None:
+            terms.append(pull.term(vertices, step, steps))
         change, used = gauss_newton_step(
             terms, None, count, damping=1e-6,
             tolerance=config.solver.tolerance, max_iterations=config.solver.max_iterations,

@@ -2,6 +2,7 @@
 
 stage.json                what was run
 garment.npz               the template
+print.npz                 what is printed on it, where anything is (`print_stage`); not made where colours are off
 frames/000123.npz         vertices (V, 3) float32, verdict (0 good, 1 check, 2 failed), and per vertex (V,) residual_m,
                           border_error_m, stretch float32 and flipped bool, as in `FrameQuality`
 metrics/000123.json       the frame's numbers, reasons and CPU time
@@ -17,7 +18,8 @@ come out otherwise; and into the next as far as that overlaps.
 from __future__ import annotations
 
 import hashlib
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -46,8 +48,10 @@ from capture4d.types import Body, Garment, PoseSequence
 from registration.chain import Chain
 from registration.config import RegistrationConfig
 from registration.predictions import Mover
+from registration.print_stage import made_print, print_inputs, settings_with_print
+from registration.prints import load_print
 from registration.take import Take, register_take
-from registration.template import analyse_template
+from registration.template import TemplateAnalysis, analyse_template
 
 __all__ = ["changes", "run"]
 
@@ -91,14 +95,26 @@ def run(
     path = output / "garment.npz"
     stage.make_unless_standing(path, lambda: save_garment(path, garment), inputs={"garment": _garment_digest(garment)})
     chain = _chain(capture, stage.ledger, garments, config, (garment, moving), body_folder)
-    if chain.todo().is_any:
+
+    @cache
+    def opened() -> tuple[TemplateAnalysis, Mover | None]:
         analysis = analyse_template(garment, config)
-        mover = None if moving is None else Mover.create(analysis, *moving)
+        return analysis, None if moving is None else Mover.create(analysis, *moving)
+
+    printed: list[Path] = []
+    if config.colour.use == "auto":
+        made_from = print_inputs(config.colour, chain.settings, chain.garments, chain.poses, capture.fps)
+        printed = made_print(stage, made_from, garment_folder, (capture.frame_ids, capture.fps), config, opened)
+        chain = replace(chain, settings=settings_with_print(chain.settings, stage.ledger))
+    if chain.todo().is_any:
+        analysis, mover = opened()
+        if printed:
+            analysis = replace(analysis, cloth=load_print(printed[0], analysis))
         stage = register_take(Take(analysis, mover, config, garment_folder, stage, chain), workers)
     paths = [stage.frame_path(frame_id) for frame_id in capture.frame_ids]
     _gather(stage, capture.frame_ids, stage.digest_of_all(paths))
     return stage.finish_growing(
-        [path, output / "vertices.npy", *paths],
+        [path, output / "vertices.npy", *paths, *printed],
         frames=len(paths),
         failed={
             record["frame_id"]: "; ".join(record["reasons"])
@@ -124,6 +140,7 @@ def changes(
             return Pending(capture.frame_ids)
         moving = _moving(capture, body_folder)
         chain = _chain(capture, ledger, garments, config, (_shaped(capture, moving), moving), body_folder)
+        chain = replace(chain, settings=settings_with_print(chain.settings, ledger))
         todo, ids = chain.todo(), capture.frame_ids
         missing = {at for at in range(len(ids)) if ledger.of(chain.file(at)) is None}
         certain = {*todo.certain} | ({*todo.following} & missing)

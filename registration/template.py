@@ -13,6 +13,7 @@ from capture4d.captures.names import unknown_borders
 from capture4d.errors import InputError
 from capture4d.geometry.mesh import doubled_area_vectors, edge_uses, edges_of_faces, normalised, unique_edges
 from capture4d.types import Garment
+from registration.cloth_colours import ClothColours
 from registration.config import RegistrationConfig
 from registration.deformation_graph import DeformationGraph, build_graph
 from registration.fold_lengths import edge_faces
@@ -65,6 +66,8 @@ class TemplateAnalysis:
     """Each vertex minus the mean of its neighbours; along the border, of its neighbours on the border."""
     laplacian_columns: Rows
     """The same, transposed."""
+    cloth: tuple[ClothColours, ...] = ()
+    """Its colours, the most blurred first; none where those of the scans do not take part."""
 
 
 def analyse_template(garment: Garment, config: RegistrationConfig) -> TemplateAnalysis:

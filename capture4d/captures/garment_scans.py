@@ -31,6 +31,7 @@ def save_garment_scan(path: Path, scan: GarmentScan, *, estimated: bool = False)
         boundary_points=scan.boundary_points,
         boundary_loops=scan.boundary_loops,
         loop_names=np.array(scan.loop_names, dtype=np.str_),
+        **({} if scan.colours is None else {"colours": scan.colours}),
         **({ESTIMATED: np.array(True)} if estimated else {}),
     )
 
@@ -49,6 +50,7 @@ def load_garment_scan(path: Path, frame_id: int) -> GarmentScan:
                 boundary_loops=arrays["boundary_loops"],
                 loop_names=arrays.names("loop_names"),
                 frame_id=frame_id,
+                **({"colours": arrays["colours"]} if "colours" in arrays else {}),
             )
         reason = str(arrays["reason"])
     raise InputError(reason)  # of the scan, which it names

@@ -55,6 +55,8 @@ class KnownColours:
     others: tuple[Colour, ...] = ()
     light: Light | None = None
     """None: given, not learned."""
+    printed: bool = False
+    """The garment has many colours, of which `garment` is the most frequent: it is what lies between the paint."""
 
     def flat(self, scan: Scan) -> Scan:
         """A scan in the light that the colours hold for."""
@@ -80,7 +82,7 @@ def take_colours(capture: Capture, *, learn: bool = False) -> KnownColours:
     if boundary:
         as_seen = dict(zip(paints, found.paints, strict=True))
         named = {name: as_seen[colour] for name, colour in boundary.items()}
-        return KnownColours(found.garment, named, tuple(named), found.others, found.light)
+        return KnownColours(found.garment, named, tuple(named), found.others, found.light, found.printed)
     names = template_loops(capture)
     if len(found.paints) == 1:
         named = dict.fromkeys(names or ("border",), found.paints[0])
@@ -151,6 +153,7 @@ def described_colours(colours: KnownColours) -> dict[str, Any]:
         "boundary_colours": {name: format_colour(colour) for name, colour in colours.boundary.items()},
         "other_colours": [format_colour(colour) for colour in colours.others],
         "loops": list(colours.loop_names),
+        **({"printed": True} if colours.printed else {}),
         "light": None
         if light is None
         else {"coefficients": light.coefficients, "centre": light.centre, "size_m": float(light.size_m)},
@@ -178,6 +181,7 @@ def read_colours(path: Path) -> KnownColours:
                 np.array(light["centre"], np.float64),
                 float(light["size_m"]),
             ),
+            bool(found.get("printed", False)),
         )
 
 

@@ -33,7 +33,11 @@ _GROUPS: Mapping[str, Sequence[str]] = {
 
 EXAMPLES: Mapping[str, Sequence[str]] = {
     "demo": ("demo --output out",),
-    "synth": ("synth take --preset tiny", "synth take --frames 60 --outfit red --scanner stereo"),
+    "synth": (
+        "synth take --preset tiny",
+        "synth take --frames 60 --outfit red --scanner stereo",
+        "synth take --print stripes",
+    ),
     "scan": ("scan meshes take --fps 30 --template template.obj",),
     "synth-board": ("synth-board capture/rig.json board --poses 16",),
     "check": ("check capture", "check scans --fps 60 --units mm --garment-colour '#2f62c9' --fix"),
@@ -43,7 +47,7 @@ EXAMPLES: Mapping[str, Sequence[str]] = {
     ),
     "extract": ("extract capture --output work",),
     "track": ("track capture --output work",),
-    "register": ("register capture --output work", "register capture --output work --tracked --preset paper"),
+    "register": ("register capture --output work", "register capture --output work --tracked --print print.png"),
     "run": (
         "run capture --output work",
         "run capture --output work --workers 8 --max-failed 2 --quiet",

@@ -27,6 +27,7 @@ from jaxtyping import Float64, Real, UInt8
 from scipy.spatial import KDTree
 
 from capture4d.colours.labels import settle_labels
+from capture4d.colours.printed_cloth import between_paint, island_share, without_specks
 from capture4d.colours.spaces import Colour, encode_colours, format_colour, linear_colours
 from capture4d.errors import InputError
 from capture4d.geometry.mesh import face_areas
@@ -58,6 +59,10 @@ BAND_LENGTH = 4.0
 """Bands are so many times longer than wide."""
 REACH_M = 0.015
 """Pieces of a scan that are nearer than this touch: a hem hangs free of the suit."""
+LARGEST_PIECE = 0.3
+"""No piece of one colour is a larger share of a printed cloth: cloth of one colour is whole but for holes."""
+LOGO_SHARE = 0.005
+"""Islands of other colours that make up more of a cloth are printed on it."""
 MARGIN = 1.3
 """The garment has so much more paint along it than the next piece of another colour."""
 
@@ -89,8 +94,10 @@ class TakeColours:
     paints: tuple[Colour, ...]
     """On the borders, the most frequent first; empty if there are none."""
     others: tuple[Colour, ...]
-    """Suit, skin, and whatever else is seen, the most frequent first."""
+    """Suit, skin, and whatever else is seen, the most frequent first; of printed cloth the other inks as well."""
     light: Light
+    printed: bool = False
+    """The cloth has many colours, of which `garment` is the most frequent."""
 
 
 def learn_colours(
@@ -128,13 +135,17 @@ def learn_colours(
     if given_paints is not None:
         _require_apart([*given_paints, *([] if given_garment is None else [given_garment])], colours, source)
     bands = [band for band in bands if band != given_garment]
-    cloth = _garment(scans, labels, len(colours), bands, colours, source) if given_garment is None else given_garment
+    ink = _ink(scans, labels, bands) if given_garment is None and given_paints else None
+    cloth = ink if given_garment is None else given_garment
+    if cloth is None:
+        cloth = _garment(scans, labels, len(colours), bands, colours, source)
     others = [index for index in range(len(colours)) if index != cloth and index not in bands]
     return TakeColours(
         garment=colours[cloth],
         paints=tuple(colours[index] for index in bands),
         others=tuple(colours[index] for index in others),
         light=light,
+        printed=ink is not None,
     )
 
 
@@ -310,6 +321,30 @@ def _bands(scans: Sequence[Scan], labels: Sequence[np.ndarray], colours: Sequenc
             found.append(index)
     pure = [index for index in found if not _is_blend(index, colours)]
     return pure or found[:1]
+
+
+def _ink(scans: Sequence[Scan], labels: Sequence[np.ndarray], bands: Sequence[int]) -> int | None:
+    """The most frequent material of a printed cloth; None where the cloth between the paint is of one colour.
+
+    It is printed if no piece of one colour makes up much of it, as with blobs, stripes and checks, or if some of it
+    lies in islands of other colours, as with a logo. Median over the scans: a hand may lie on the cloth in one.
+    """
+    largest, islands, inks = [], [], np.zeros(int(max(label.max(initial=0) for label in labels)) + 1)
+    for scan, label in zip(scans, labels, strict=True):
+        faces = scan.mesh.faces
+        painted = without_specks(faces, np.isin(label, bands))
+        cloth = between_paint(faces, painted)
+        if not cloth.any():
+            continue
+        inside = cloth[faces].all(axis=1) & (label[faces] == label[faces][:, :1]).all(axis=1)
+        piece = face_components(faces, len(label), inside)
+        largest.append(np.bincount(piece[piece >= 0], minlength=1).max() / max(int(cloth[faces].all(axis=1).sum()), 1))
+        own = np.bincount(label[cloth], minlength=len(inks))
+        islands.append(island_share(faces, cloth & (label == own.argmax()), painted))
+        inks += own
+    if not largest or (np.median(largest) > LARGEST_PIECE and np.median(islands) < LOGO_SHARE):
+        return None
+    return int(inks.argmax())
 
 
 def _vertex_area(mesh: Mesh) -> float:

@@ -23,6 +23,7 @@ from scipy.sparse import csgraph
 
 from capture4d.captures.take_colours import KnownColours
 from capture4d.colours.labels import FIRST_PAINT, GARMENT, OTHER, classify_colours, settle_labels
+from capture4d.colours.printed_cloth import label_print
 from capture4d.colours.spaces import Colour, format_colour
 from capture4d.errors import InputError
 from capture4d.extraction.band_borders import border_beyond_rim
@@ -71,6 +72,8 @@ def extract_garment(
     boundary_colours: Mapping[str, Colour],
     *,
     other_colours: tuple[Colour, ...] = (),
+    printed: bool = False,
+    as_scanned: UInt8[np.ndarray, "verts 3"] | None = None,
     source: str = "scan",
 ) -> GarmentScan:
     """Cut the garment out of a scan.
@@ -79,15 +82,19 @@ def extract_garment(
         garment_colour: sRGB of the cloth.
         boundary_colours: sRGB of the paint on each named border; equal colours cannot tell their loops apart.
         other_colours: sRGB of what else there is, where it is known: suit, skin.
+        printed: the garment has many colours, of which `garment_colour` is but one: it is what lies between the paint.
+        as_scanned: sRGB that the garment keeps, if the scan's are changed.
         source: how errors call the scan, usually its path.
     Raises:
         ColourNotFoundError: the garment's or a border's colour is not in the scan.
     """
     paints = tuple(dict.fromkeys(boundary_colours.values()))
     labels = classify_colours(scan.colours, garment_colour, paints, others=other_colours)
-    _require_colours(labels, garment_colour, paints, source)
+    _require_colours(labels, None if printed else garment_colour, paints, source)
     faces = scan.mesh.faces
     labels = settle_labels(faces, labels)
+    if printed:
+        labels = label_print(faces, labels)
     mask = _garment_faces(faces, labels)
     if not mask.any():
         raise ColourNotFoundError(
@@ -107,6 +114,7 @@ def extract_garment(
         boundary_loops=loop_of_paint[paint.astype(np.int64) - FIRST_PAINT],
         loop_names=tuple(boundary_colours),
         frame_id=scan.frame_id,
+        colours=(scan.colours if as_scanned is None else as_scanned)[used],
     )
 
 
@@ -128,11 +136,12 @@ def painted_border(
     return _border_points(mesh, labels, 1)[0]
 
 
-def _require_colours(labels: np.ndarray, garment_colour: Colour, paints: tuple[Colour, ...], source: str) -> None:
+def _require_colours(labels: np.ndarray, garment: Colour | None, paints: tuple[Colour, ...], source: str) -> None:
+    """Raise where the paints, or the one colour of a garment that has one, are hardly seen."""
     share = np.bincount(labels, minlength=FIRST_PAINT + len(paints)) / max(len(labels), 1)
-    wanted = [("garment colour", garment_colour, 10 * MIN_SHARE), *(("border colour", p, MIN_SHARE) for p in paints)]
+    wanted = [("garment colour", garment, 10 * MIN_SHARE), *(("border colour", p, MIN_SHARE) for p in paints)]
     for index, (name, colour, least) in enumerate(wanted, start=GARMENT):
-        if share[index] < least:
+        if colour is not None and share[index] < least:
             raise ColourNotFoundError(
                 f"{source}: {name} {format_colour(colour)} not found: expected at least "
                 f"{100 * least:g} % of the vertices, found {100 * share[index]:.2g} %"
@@ -262,8 +271,9 @@ def cut_out(scan: Scan, colours: KnownColours, *, source: str = "scan") -> Garme
         ColourNotFoundError: the scan is sound, but the garment or a paint is not in it.
     """
     garment = extract_garment(
-        colours.flat(scan), colours.garment, colours.boundary, other_colours=colours.others, source=source
-    )
+        colours.flat(scan), colours.garment, colours.boundary,
+        other_colours=colours.others, printed=colours.printed, as_scanned=scan.colours, source=source,
+    )  # fmt: skip
     if colours.light is None:
         return garment
     if colours.loop_names != garment.loop_names:

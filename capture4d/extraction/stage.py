@@ -94,6 +94,8 @@ def run(
         overwrite=overwrite,
     )
     taken = colours_of_take(capture, output, learn=config.learn_colours)
+    if taken.newly and taken.colours.printed:
+        say(f"{output.name}: the cloth is printed: all between its painted borders is the garment")
     inputs = _inputs(capture, taken.colours)
     pending = _pending(capture, stage.ledger, inputs)
     if pending.replaced:

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from capture4d.colours.labels import classify_colours, settle_labels
+from capture4d.colours.printed_cloth import label_print
 from capture4d.colours.spaces import Colour
 from capture4d.errors import InputError
 from capture4d.geometry.mesh_kernels import open_vertices, vertex_normals_kernel
@@ -42,18 +43,28 @@ def subsample(scan: ScanPoints, count: int) -> ScanPoints:
 
 
 def scan_points(
-    scan: Scan, garment_colour: Colour, paints: tuple[Colour, ...], config: SamplingConfig, *, source: str = "scan"
+    scan: Scan,
+    garment_colour: Colour,
+    paints: tuple[Colour, ...],
+    config: SamplingConfig,
+    *,
+    printed: bool = False,
+    source: str = "scan",
 ) -> ScanPoints:
     """Points, normals and labels of a scan, in random but fixed order.
 
     Vertices on open edges are left out: their normals are half a neighbourhood's.
 
+    Args:
+        printed: the garment has many colours, and is what lies between the paint.
     Raises:
         InputError: there is nothing left of the scan.
     """
     faces = scan.mesh.faces
     vertices = scan.mesh.vertices.astype(np.float64)
     labels = settle_labels(faces, classify_colours(scan.colours, garment_colour, paints))
+    if printed:
+        labels = label_print(faces, labels)
     normals = vertex_normals_kernel(vertices, faces)
     on_edge, used = open_vertices(faces, len(vertices))
     usable = used & ~on_edge & normals.any(axis=1)

@@ -78,6 +78,7 @@ class TrackedTake:
         assert body is not None
         colours = described_colours(self.colours)
         seen = [colours["garment_colour"], self.paints, colours["light"]]
+        seen += ["printed"] if self.colours.printed else []
         shared = reads_of(self.capture, self.config).shared
         return digest_of([self.config, self.capture.units, seen, body.digest, shared.get("start")])
 
@@ -95,7 +96,10 @@ class TrackedTake:
                 begin_frame(path)
                 scan = self.colours.flat(read_scan(self.capture, frame_id))
                 source = str(scan_path(self.capture, frame_id))
-                points = scan_points(scan, self.colours.garment, self.paints, self.config.sampling, source=source)
+                points = scan_points(
+                    scan, self.colours.garment, self.paints, self.config.sampling,
+                    printed=self.colours.printed, source=source,
+                )  # fmt: skip
             except InputError as error:
                 fault = str(error)
         return points, fault, looked

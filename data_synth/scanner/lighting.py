@@ -1,4 +1,4 @@
-"""Light on the scanned surfaces: even, strongly from one side, or in two colour temperatures.
+"""Light on the scanned surfaces: even, strongly from one side or from above, or in two colour temperatures.
 
 Lamps stand still while the subject moves. Except under even light, which is the weak shading of a diffuse cage, light
 is added in linear light, Lambert's law and the square of the distance included, and encoded as sRGB.
@@ -19,7 +19,7 @@ from capture4d.types import Rig
 from data_synth.scanner.config import Lighting, ShadingConfig
 from data_synth.scanner.raycast import Surface
 
-__all__ = ["light"]
+__all__ = ["flicker", "light"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +40,10 @@ class _Lamps:
 WARM, COOL = np.array([1.0, 0.85, 0.64]), np.array([0.66, 0.8, 1.0])
 
 
+FLICKER = 0.03
+"""Standard deviation of the overhead lamp's strength from frame to frame, channel by channel."""
+
+
 def _times(colour: np.ndarray, strength: float) -> tuple[float, float, float]:
     red, green, blue = (strength * colour).tolist()
     return red, green, blue
@@ -47,6 +51,7 @@ def _times(colour: np.ndarray, strength: float) -> tuple[float, float, float]:
 
 LAMPS: Mapping[Lighting, _Lamps] = {
     "side": _Lamps((0.16, 0.16, 0.16), (_Lamp((0.8, 0.25, 0.3), (0.6, 0.6, 0.6)),)),
+    "overhead": _Lamps((0.3, 0.3, 0.3), (_Lamp((0.3, 0.8, 0.5), (0.6, 0.6, 0.6)),)),
     "two-temperature": _Lamps(
         (0.2, 0.2, 0.2), (_Lamp((0.8, 0.3, 0.5), _times(WARM, 0.55)), _Lamp((-0.8, 0.2, 0.1), _times(COOL, 0.55)))
     ),
@@ -59,10 +64,17 @@ def light(surface: Surface, rig: Rig, *, shading: ShadingConfig) -> Float32[np.n
     match shading.lighting:
         case "even":
             return _even(surface, normals, shading.ambient)
-        case "side" | "two-temperature":
+        case "side" | "overhead" | "two-temperature":
             return _lamplit(surface, normals, LAMPS[shading.lighting], rig)
         case _:
             assert_never(shading.lighting)
+
+
+def flicker(shading: ShadingConfig, rng: np.random.Generator) -> Float32[np.ndarray, " 3"]:
+    """What a frame's light is off by, channel by channel; only the overhead lamp flickers, and draws from `rng`."""
+    if shading.lighting != "overhead":
+        return np.ones(3, np.float32)
+    return (1 + FLICKER * rng.standard_normal(3)).astype(np.float32)
 
 
 def _even(surface: Surface, normals: np.ndarray, ambient: float) -> np.ndarray:

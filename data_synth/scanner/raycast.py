@@ -13,7 +13,7 @@ from numba import njit
 from capture4d.geometry.ray_casting import TriangleScene
 from capture4d.types import Mesh, Rig
 
-__all__ = ["NOTHING", "CameraImages", "Surface", "SurfaceScene", "nearest_surface"]
+__all__ = ["NOTHING", "CameraImages", "Print", "Surface", "SurfaceScene", "nearest_surface"]
 
 NOTHING = 255
 """In a surface image: no surface."""
@@ -21,6 +21,18 @@ SHADOW_BIAS = 0.001
 """A surface this share of the way to a lamp before a point does not shade it."""
 TILE = 8
 """Rays are cast in square tiles of pixels; one probe ray per tile decides whether it is worth it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Print:
+    """What is printed on a cloth: an image over its pattern, finer than the cloth's mesh."""
+
+    image: Float32[np.ndarray, "rows columns 3"]
+    """sRGB, 0 to 1."""
+    places: Float32[np.ndarray, "faces 3 2"]
+    """Column and row in the image of each face corner; pixel centres lie at integers."""
+    share: Float32[np.ndarray, "faces 3"]
+    """1 where a face corner is printed, 0 where it has the surface's own colour."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,6 +48,8 @@ class Surface:
     """Edge of the voxels it is fused in."""
     painted: Bool[np.ndarray, " verts"] | None = None
     """The vertices of a garment in the paint along its borders, whatever the colours; None if there is none."""
+    print: Print | None = None
+    """Multiplies the colours, as ink does those of the cloth below it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,6 +95,7 @@ class SurfaceScene:
         self._first_face = np.cumsum([0, *(len(s.mesh.faces) for s in surfaces)])
         corner_colours = [(lit or unlit)(s)[s.mesh.faces] for s in surfaces]
         self._corner_colours = np.concatenate(corner_colours)  # (F, 3 corners, 3)
+        self._print = _joined_prints(surfaces)
 
     def view(self, rig: Rig, camera: int) -> CameraImages | None:
         """The images of one camera, or None where it sees nothing."""
@@ -115,6 +130,9 @@ class SurfaceScene:
             hits.normals,
             self._first_face,
             self._corner_colours,
+            self._print.image,
+            self._print.places,
+            self._print.share,
             self._thickness,
         )
         return CameraImages(depth, cosine, surface, colours, origin=(int(top), int(left)))
@@ -150,6 +168,17 @@ def unlit(surface: Surface) -> Float32[np.ndarray, "verts 3"]:
     return surface.colours.astype(np.float32) / 255
 
 
+def _joined_prints(surfaces: Sequence[Surface]) -> Print:
+    """The print of the one surface that has one, over the faces of all."""
+    printed = [surface.print for surface in surfaces if surface.print is not None]
+    assert len(printed) <= 1, "one garment is scanned"
+    if not printed:
+        return Print(np.zeros((0, 0, 3), np.float32), np.zeros((0, 3, 2), np.float32), np.zeros((0, 3), np.float32))
+    places = [np.zeros((len(s.mesh.faces), 3, 2), np.float32) if s.print is None else s.print.places for s in surfaces]
+    share = [np.zeros((len(s.mesh.faces), 3), np.float32) if s.print is None else s.print.share for s in surfaces]
+    return Print(printed[0].image, np.concatenate(places), np.concatenate(share))
+
+
 def _rays(rig: Rig, camera: int, u: np.ndarray, v: np.ndarray) -> Float32[np.ndarray, "rays 6"]:
     """Rays through pixels (u, v); a direction reaches depth 1, so that the hit distance is the depth."""
     K, T = rig.intrinsics[camera], rig.T_camera_world[camera]
@@ -177,6 +206,9 @@ def _fill_images(
     normals,
     first_face,
     corner_colours,
+    image,
+    places,
+    share,
     thickness,
 ):
     """Scatter the hits of rays to the pixels (rows, columns) they went through."""
@@ -190,9 +222,26 @@ def _fill_images(
         depth[row, column] = t_hit[ray] - (thickness / max(toward, 0.1 * length) if toward > 0 else 0)
         cosine[row, column] = -toward / length
         surface[row, column] = surface_ids[ray]
-        corners = corner_colours[first_face[surface_ids[ray]] + face_ids[ray]]
+        face = first_face[surface_ids[ray]] + face_ids[ray]
+        corners = corner_colours[face]
         second, third = uv[ray, 0], uv[ray, 1]
+        first = 1 - second - third
         for channel in range(3):
             colours[row, column, channel] = (
-                (1 - second - third) * corners[0, channel] + second * corners[1, channel] + third * corners[2, channel]
+                first * corners[0, channel] + second * corners[1, channel] + third * corners[2, channel]
+            )
+        if len(image) == 0 or max(share[face, 0], share[face, 1], share[face, 2]) == 0:
+            continue
+        x = first * places[face, 0, 0] + second * places[face, 1, 0] + third * places[face, 2, 0]
+        y = first * places[face, 0, 1] + second * places[face, 1, 1] + third * places[face, 2, 1]
+        x, y = min(max(x, 0.0), image.shape[1] - 1.001), min(max(y, 0.0), image.shape[0] - 1.001)
+        left, top = int(x), int(y)
+        across, down = x - left, y - top
+        for channel in range(3):
+            ink = (1 - down) * ((1 - across) * image[top, left, channel] + across * image[top, left + 1, channel])
+            ink += down * ((1 - across) * image[top + 1, left, channel] + across * image[top + 1, left + 1, channel])
+            colours[row, column, channel] = (
+                first * corners[0, channel] * (1 + share[face, 0] * (ink - 1))
+                + second * corners[1, channel] * (1 + share[face, 1] * (ink - 1))
+                + third * corners[2, channel] * (1 + share[face, 2] * (ink - 1))
             )

@@ -21,7 +21,7 @@ from capture4d.types import Mesh, Rig, Scan
 from data_synth.scanner.config import ScannerConfig
 from data_synth.scanner.depth_noise import corrupt_depth, draw_noise_fields
 from data_synth.scanner.fusion import DepthFusion
-from data_synth.scanner.lighting import light
+from data_synth.scanner.lighting import flicker, light
 from data_synth.scanner.raycast import NOTHING, Surface, SurfaceScene, nearest_surface
 from data_synth.scanner.stereo import match_pair, speckle_pair
 
@@ -63,6 +63,7 @@ def scan_surfaces(
         return _scan_stereo(rig, surfaces, config, rng, frame_id, time_s)
     lit = partial(light, rig=rig, shading=config.shading)
     scene = SurfaceScene(surfaces, lit=lit, thickness_m=config.fusion.thickness_m)
+    frame_gain = flicker(config.shading, rng)
     fields = draw_noise_fields(config.noise, rng, largest_image=int(rig.image_sizes.max()))
     sized = [(surface, _area(surface)) for surface in surfaces]
     volumes = [DepthFusion(surface.voxel_m, area, config=config.fusion) for surface, area in sized]
@@ -75,6 +76,7 @@ def scan_surfaces(
             continue
         depth = corrupt_depth(images.depth, np.abs(images.cosine), fields, config=config.noise, rng=rng)
         colours = images.colours * np.float32(1 + config.shading.camera_gain * rng.standard_normal())
+        colours *= frame_gain
         colours += np.float32(config.shading.pixel_noise) * fields.window(fields.colour, depth.shape, rng)
         K = rig.intrinsics[camera].copy()
         K[:2, 2] -= images.origin[::-1]
@@ -102,6 +104,7 @@ def _scan_stereo(
         sum(_area(surface) for surface in surfaces),
         config=replace(config.fusion, min_weight=config.stereo.min_weight),
     )
+    frame_gain = flicker(config.shading, rng)
     for left in range(0, len(rig.names), 2):
         pair = speckle_pair(bare, rig, left, config=config.stereo, rng=rng)
         gain = 1 + config.shading.camera_gain * rng.standard_normal()
@@ -111,7 +114,7 @@ def _scan_stereo(
         if images is not None:
             rows, columns = images.window
             colours[rows, columns] = np.where((images.surface == NOTHING)[..., None], BACKDROP, images.colours)
-        colours = (gain * colours + noise).astype(np.float32)
+        colours = (gain * colours * frame_gain + noise).astype(np.float32)
         depth = match_pair(pair, colours, config=config.stereo)
         volume.add(depth, colours, rig.intrinsics[left], rig.T_camera_world[left])
     mesh, colours = volume.extract()

@@ -28,6 +28,7 @@ from capture4d.captures.garment_scans import load_garment_scan
 from capture4d.captures.take_colours import COLOURS, KnownColours, read_colours, take_colours
 from capture4d.captures.work_folder import WorkFolder, load_tracking
 from capture4d.colours.labels import classify_colours, settle_labels
+from capture4d.colours.printed_cloth import label_print
 from capture4d.errors import InputError
 from capture4d.files.arrays import ArrayFile
 from capture4d.files.atomic import read_json, read_json_lines
@@ -284,6 +285,8 @@ def _draw_row(drawing: _Drawing, row: int) -> StagePictures:
     paints = tuple(dict.fromkeys(colours.boundary.values()))
     found = classify_colours(colours.flat(scan).colours, colours.garment, paints, others=colours.others)
     labels = settle_labels(scan.mesh.faces, found)
+    if colours.printed:
+        labels = label_print(scan.mesh.faces, labels)
     painted = LABELS[np.minimum(labels, 2)]
     cloth = scan.mesh.vertices[labels > 0] if (labels > 0).any() else scan.mesh.vertices
     garment = drawing.work / "garment" / "frames" / f"{frame_id:06d}.npz"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -101,23 +101,25 @@ class Register(DryRunOptions, TakeOptions, GradedOptions, MeshOptions):
     """Move the template with the body that `track` found, not with the poses the capture brings."""
     preset: Literal["default", "paper"] = "default"
     """What the settings below start from; `paper` is DeepWrinkles as printed."""
+    print: Path | None = None
+    """Picture of what is printed on the cloth, over the template's UVs; short for --registration.colour.print."""
     config: Annotated[RegistrationConfig, arg(name="registration")] = field(default_factory=RegistrationConfig)
 
     def __call__(self) -> int:
         from capture4d import pipeline
         from capture4d.app.status.work_folders import plan_stage
 
-        taken = self.taken(self.capture)
+        taken, config = self.taken(self.capture), _with_print(self.config, self.print)
         if self.dry_run:
             return self.told(plan_stage(
-                taken, self.output, self.config,
+                taken, self.output, config,
                 tracked=self.tracked, workers=self.workers, overwrite=self.overwrite,
             ))  # fmt: skip
         _say_lengths(taken)
         result = pipeline.register(
             taken,
             self.output,
-            self.config,
+            config,
             tracked=self.tracked,
             workers=self.workers,
             overwrite=self.overwrite,
@@ -137,6 +139,8 @@ class Run(DryRunOptions, DecidingOptions, GradedOptions, MeshOptions):
     """Work folder."""
     preset: Literal["default", "paper"] = "default"
     """What the settings of the registration start from; `paper` is DeepWrinkles as printed."""
+    print: Path | None = None
+    """Picture of what is printed on the cloth, over the template's UVs; short for --registration.colour.print."""
     tracked: bool = False
     """Track the body, and move the template with it, even if the capture brings poses."""
     config: Annotated[RegistrationConfig, arg(name="registration")] = field(default_factory=RegistrationConfig)
@@ -145,10 +149,10 @@ class Run(DryRunOptions, DecidingOptions, GradedOptions, MeshOptions):
     def __call__(self) -> int:
         from capture4d import pipeline
 
-        taken = self.taken(self.capture)
+        taken, config = self.taken(self.capture), _with_print(self.config, self.print)
         if self.dry_run:
             return self.told(pipeline.plan(
-                taken, self.output, self.config, tracking=self.tracking, tracked=self.tracked,
+                taken, self.output, config, tracking=self.tracking, tracked=self.tracked,
                 renew=self.to_renew, workers=self.workers, overwrite=self.overwrite,
             ))  # fmt: skip
         self.renewed(self.output)
@@ -156,7 +160,7 @@ class Run(DryRunOptions, DecidingOptions, GradedOptions, MeshOptions):
         result = pipeline.run(
             taken,
             self.output,
-            self.config,
+            config,
             tracking=self.tracking,
             tracked=self.tracked,
             workers=self.workers,
@@ -166,6 +170,13 @@ class Run(DryRunOptions, DecidingOptions, GradedOptions, MeshOptions):
         say_work(self.output)
         print(f"report: {result.path}")
         return self.graded(result)
+
+
+def _with_print(config: RegistrationConfig, picture: Path | None) -> RegistrationConfig:
+    """Settings of the registration with another print, if one is given."""
+    if picture is None:
+        return config
+    return replace(config, colour=replace(config.colour, print=str(picture)))
 
 
 def _say_lengths(capture: AnyCapture) -> None:

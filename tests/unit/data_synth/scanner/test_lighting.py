@@ -8,7 +8,7 @@ import pytest
 from capture4d.types import Mesh, Rig
 from data_synth.outfits import OUTFITS
 from data_synth.scanner.config import ShadingConfig
-from data_synth.scanner.lighting import light
+from data_synth.scanner.lighting import flicker, light
 from data_synth.scanner.raycast import Surface
 from data_synth.scanner.rig import capture_rig
 
@@ -66,3 +66,13 @@ def test_outfits_are_told_apart_by_eye() -> None:
         colours = np.array([outfit.garment, outfit.border, outfit.suit, outfit.skin], float)
         apart = np.linalg.norm(colours[:, None] - colours, axis=2)
         assert apart[np.triu_indices(4, 1)].min() > 40
+
+
+def test_only_the_overhead_lamp_flickers(rig: Rig) -> None:
+    rng, untouched = np.random.default_rng(2), np.random.default_rng(2)
+    assert flicker(ShadingConfig(lighting="side"), rng).tolist() == [1, 1, 1]
+    assert rng.random() == untouched.random()
+    gains = np.array([flicker(ShadingConfig(lighting="overhead"), rng) for _ in range(400)])
+    np.testing.assert_allclose(gains.std(axis=0), 0.03, rtol=0.15)
+    above, below = (linear(patch(rig, (0, y, 0), (180, 180, 180), 0.2), rig, "overhead") for y in (1, -1))
+    assert (above > 1.5 * below).all()
