@@ -201,10 +201,9 @@ def _dense_stage(
         lengths = folded_lengths(
             scan.surface, vertices, analysis.faces, analysis.edges, analysis.edge_faces, analysis.rest_lengths
         )
-    pull, steps, lengths_weight = None, schedule.steps, schedule.stretch
+    pull, steps = None, schedule.steps
     if steps and scan.colours is not None:
         pull, steps = ColourPull(analysis, scan.surface, scan.colours, config.colour), steps + config.colour.steps
-        lengths_weight = (lengths_weight[0], max(lengths_weight[1], config.colour.stretch))
     for step in range(steps):
         at = (min(step, schedule.steps - 1), schedule.steps)
         gate = anneal(schedule.gate, *at)
@@ -215,8 +214,15 @@ def _dense_stage(
         )  # fmt: skip
         stretch, excess = stretch_metric(
             edge_vectors(vertices, analysis.edges), lengths,
-            weight=anneal(lengths_weight, *at), compression=config.dense.compression,
+            weight=anneal(schedule.stretch, *at), compression=config.dense.compression,
         )  # fmt: skip
+        if pull is not None:
+            raised = (schedule.stretch[0], max(schedule.stretch[1], config.colour.stretch))
+            held, _ = stretch_metric(
+                edge_vectors(vertices, analysis.edges), lengths,
+                weight=anneal(raised, *at), compression=config.dense.compression,
+            )  # fmt: skip
+            stretch = np.where(pull.printed_edges[:, None, None], held, stretch)
         terms.append(RowTerm(analysis.edge_rows, stretch, excess))
         bending = analysis.laplacian_rows.apply(vertices[:, :, None]) - reference
         smooth = np.ascontiguousarray(np.broadcast_to(anneal(schedule.smooth, *at) / count * np.eye(3), (count, 3, 3)))
