@@ -53,6 +53,10 @@ class ColourPull:
         """
         self._analysis, self._surface, self._colours, self._config = analysis, surface, colours, config
         self._seen: SeenColours | None = None
+        sharp = analysis.cloth[-1]
+        printed = np.zeros(len(analysis.rest), bool)
+        printed[sharp.samples.vertices[sharp.known]] = True
+        self.printed_edges = printed[analysis.edges].all(axis=1)
 
     def term(self, vertices: Float64[np.ndarray, "verts 3"], step: int, steps: int) -> RowTerm:
         """Pull the template to where its colours are the scan's, which are looked up every few steps."""

@@ -41,7 +41,7 @@ LEVELS = ((0.014, 0.022), (0.007, 0.0065))
 from 8 mm away, and to half a millimetre (`python -m benchmarks registration --data printed`)."""
 LESS_WIDE = (0.015, 0.01)
 """Reaches of the wide blur for prints that are too fine to be seen under it, such as stripes."""
-SEEN_SHARE = 0.2
+SEEN_SHARE = 0.24
 """Of the narrowly blurred colours' variance, that is left under a wide blur that sees the print."""
 LEAST_SPACINGS = 2.5
 """No blur reaches less far than so many sample spacings of the scan."""
@@ -110,7 +110,7 @@ def learn_print(
             for scan, vertices in frames
         ]
         cloth = _average(analysis, samples, frames, cloth, reaches)
-    return cloth, contrast
+    return _where_printed(analysis, cloth), contrast
 
 
 def _coloured_frame(analysis: TemplateAnalysis, scan: GarmentScan, config: RegistrationConfig) -> FrameScan:
@@ -172,7 +172,7 @@ def print_of_picture(
             found.append(_cloth(analysis, samples, reach, values, samples.inner, gradients))
         return tuple(found)
 
-    return coloured(_reaches(coloured))
+    return _where_printed(analysis, coloured(_reaches(coloured)))
 
 
 def save_print(path: Path, cloth: Sequence[ClothColours], contrast: float) -> None:
@@ -213,6 +213,18 @@ def _samples(analysis: TemplateAnalysis) -> list[ColourSamples]:
         aside = near[analysis.faces].any(axis=1)
     edge = float(analysis.rest_lengths.mean())
     return [sample_faces(analysis.faces, max(1, round(edge / spacing)), aside) for spacing, _ in LEVELS]
+
+
+def _where_printed(analysis: TemplateAnalysis, cloth: Sequence[ClothColours]) -> tuple[ClothColours, ...]:
+    """The same, known only where there is a print within a hand's breadth: on plain cloth beside a logo colours tell of
+    nothing but folds under a lamp."""
+    sharp = cloth[-1]
+    known = sharp.known.astype(np.float64)
+    square = without_light(analysis, sharp.samples, sharp.values, known) ** 2
+    around = (square - without_light(analysis, sharp.samples, square, known)).sum(axis=1)
+    printed = np.zeros(len(analysis.rest), bool)
+    printed[sharp.samples.vertices[sharp.known & (around > (CONTRAST / 2) ** 2)]] = True
+    return tuple(replace(each, known=each.known & printed[each.samples.vertices].all(axis=1)) for each in cloth)
 
 
 def _reaches(coloured: Callable[[Sequence[float]], Sequence[ClothColours]]) -> tuple[float, float]:

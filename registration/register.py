@@ -204,10 +204,9 @@ def _dense_stage(
         lengths = folded_lengths(
             scan.surface, vertices, analysis.faces, analysis.edges, analysis.edge_faces, analysis.rest_lengths
         )
-    pull, steps, lengths_weight = None, schedule.steps, schedule.stretch
+    pull, steps = None, schedule.steps
     if steps and scan.colours is not None:
         pull, steps = ColourPull(analysis, scan.surface, scan.colours, config.colour), steps + config.colour.steps
-        lengths_weight = (lengths_weight[0], max(lengths_weight[1], config.colour.stretch))
     for step in range(steps):
         at = (min(step, schedule.steps - 1), schedule.steps)
         gate = anneal(schedule.gate, *at)
@@ -216,12 +215,18 @@ def _dense_stage(
             analysis, border_rows, scan, vertices, anneal(schedule.boundary, *at), config.boundary.gate,
             rule=config.boundary.dense_rule, along_curve=config.boundary.along_curve,
         )  # fmt: skip
-        terms.append(
-            stretch_term(
-                vertices, analysis.edges, lengths,
-                weight=anneal(lengths_weight, *at), compression=config.dense.compression,
-            )
+        lengths_term = stretch_term(
+            vertices, analysis.edges, lengths,
+            weight=anneal(schedule.stretch, *at), compression=config.dense.compression,
         )  # fmt: skip
+        if pull is not None:
+            raised = (schedule.stretch[0], max(schedule.stretch[1], config.colour.stretch))
+            held = stretch_term(
+                vertices, analysis.edges, lengths,
+                weight=anneal(raised, *at), compression=config.dense.compression,
+            )  # fmt: skip
+            lengths_term = lengths_term.with_others(held, pull.printed_edges)
+        terms.append(lengths_term)
         bending = analysis.laplacian_rows.apply(vertices[:, :, None]) - reference
         terms.append(
             SmoothTerm(

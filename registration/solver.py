@@ -20,7 +20,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64, Int32, Integer
+from jaxtyping import Bool, Float64, Int32, Integer
 
 from capture4d.heavy_imports import njit
 
@@ -91,6 +91,11 @@ class EdgeTerm:
     """a_e, with the root of the weight in it."""
     residual: Float64[np.ndarray, " edges"]
     """r_e, with the same."""
+
+    def with_others(self, others: EdgeTerm, chosen: Bool[np.ndarray, " edges"]) -> EdgeTerm:
+        """The same with some of its edges from another term of the same edges."""
+        directions = np.where(chosen[:, None], others.directions, self.directions)
+        return EdgeTerm(self.edges, directions, np.where(chosen, others.residual, self.residual))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
