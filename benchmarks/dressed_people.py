@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from capture4d.body.anny import load_anny
 from capture4d.body.skinning import ShapedBody, skin, with_pose, with_shape
 from capture4d.cache import user_cache_folder
+from capture4d.files.atomic import write_npz
 from capture4d.geometry.mesh import doubled_area_vectors, face_areas, normalised, unique_edges, vertex_normals
 from capture4d.geometry.mesh_kernels import mean_edge_length
 from capture4d.geometry.ray_casting import closest_points
@@ -104,9 +105,7 @@ def make_pair(person: Person) -> PeoplePair:
     if not path.exists():
         made = _make(person)
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_suffix(".partial.npz")
-        np.savez(partial, **made)
-        partial.replace(path)
+        write_npz(path, **made)
     with np.load(path) as stored:
         part = {name: stored[name] for name in stored.files}
     meshes = {n: Mesh(part[f"{n}_vertices"], part[f"{n}_faces"]) for n in ("template", "scan", "truth")}

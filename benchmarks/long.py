@@ -22,6 +22,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from rich.console import Console
@@ -195,7 +196,7 @@ def _run_with_a_loss(folder: Path, cut: Cut, address: str) -> tuple[Outcome, int
 
     with Client(address, set_as_default=False) as client:
         client.wait_for_workers(2)
-        pids = client.run(os.getpid)
+        pids = cast(dict[str, int], client.run(os.getpid))
     begin, output = time.perf_counter(), folder / "cluster"
     process = _start(folder, "cluster", cut, 1, address)
     wanted, killed = len(read_capture(folder / "capture").frame_ids) // 3, 0

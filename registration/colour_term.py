@@ -56,7 +56,7 @@ class ColourPull:
         sharp = analysis.cloth[-1]
         printed = np.zeros(len(analysis.rest), bool)
         printed[sharp.samples.vertices[sharp.known]] = True
-        self.printed_edges = printed[analysis.edges].all(axis=1)
+        self.printed_edges = np.asarray(printed[analysis.edges].all(axis=1))
 
     def term(self, vertices: Float64[np.ndarray, "verts 3"], step: int, steps: int) -> RowTerm:
         """Pull the template to where its colours are the scan's, which are looked up every few steps."""

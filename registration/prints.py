@@ -210,7 +210,7 @@ def _samples(analysis: TemplateAnalysis) -> list[ColourSamples]:
     if len(analysis.border.vertices):
         border = PointGrid.build(analysis.rest[analysis.border.vertices], FROM_BORDER_M)
         near = np.isfinite(border.query(analysis.rest, FROM_BORDER_M)[0])
-        aside = near[analysis.faces].any(axis=1)
+        aside = np.asarray(near[analysis.faces].any(axis=1))
     edge = float(analysis.rest_lengths.mean())
     return [sample_faces(analysis.faces, max(1, round(edge / spacing)), aside) for spacing, _ in LEVELS]
 

@@ -137,8 +137,9 @@ def gauss_newton_step(
     Returns:
         The step and the number of iterations.
     """
-    kinds = tuple([term for term in terms if isinstance(term, kind)] for kind in (RowTerm, EdgeTerm, SmoothTerm))
-    row_terms, edge_terms, smooth_terms = kinds
+    row_terms = [term for term in terms if isinstance(term, RowTerm)]
+    edge_terms = [term for term in terms if isinstance(term, EdgeTerm)]
+    smooth_terms = [term for term in terms if isinstance(term, SmoothTerm)]
     rows = _stacked([term for term in row_terms if not term.rows.is_identity])
     width = 1 if edge_terms or smooth_terms or not len(rows.coefficients) else rows.coefficients.shape[1]
     size = 3 * width
