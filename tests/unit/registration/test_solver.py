@@ -3,14 +3,9 @@
 import numpy as np
 import pytest
 
-from registration.solver import (
-    BlockTerm,
-    EdgeTerm,
-    Rows,
-    RowTerm,
-    SmoothTerm,
+from registration.solver import BlockTerm, EdgeTerm, Rows, RowTerm, SmoothTerm, gauss_newton_step
+from registration.solver_loops import (
     add_block_diagonal,
-    gauss_newton_step,
     invert_points,
     normal_product_affine,
     normal_product_points,
