@@ -233,6 +233,8 @@ def _misfit(analysis: TemplateAnalysis, scan: FrameScan, vertices: np.ndarray) -
 
 # --- verdicts ----------------------------------------------------------------------------------------------------
 
+FACETS = 0.05
+"""Share of an edge by which a face may cut off what is round: a coarse template has not failed for it."""
 TIGHT_MM, TIGHT_STRETCH = 0.8, 1.6
 """Mean distance from template to scan, and 99th percentile of the stretch, of what needs no other attempt."""
 
@@ -269,13 +271,14 @@ def judge(
     beyond = np.isin(nearest, analysis.border.vertices)  # of an open border, where the scan may go on
     away = every if beyond.all() else every[~beyond]
     mean, far = 1e3 * float(away.mean()), 1e3 * float(np.percentile(away, 95))
+    facets = 1e3 * FACETS * float(analysis.rest_lengths.mean())
     past = 100.0 * float((beyond & (1e3 * every > config.far_fail_mm)).mean())
     share = 100.0 / max(len(analysis.faces), 1)
     flipped, cut = quality.numbers["flipped_faces"] * share, quality.numbers["self_intersections"] * share
     failed, check = [], []
     for name, value, doubtful, wrong, unit in (
-        ("mean distance from scan to template", mean, config.check_mm, config.fail_mm, " mm"),
-        ("95 % of the scan within", far, config.far_check_mm, config.far_fail_mm, " mm"),
+        ("mean distance from scan to template", mean, config.check_mm + facets, config.fail_mm + facets, " mm"),
+        ("95 % of the scan within", far, config.far_check_mm + facets, config.far_fail_mm + facets, " mm"),
         ("share of the scan beyond the template's borders", past, config.beyond_check_percent, np.inf, " %"),
         ("flipped faces", flipped, np.inf, config.flipped_fail_percent, " %"),
         ("self-intersecting faces", cut, np.inf, config.cut_fail_percent, " %"),

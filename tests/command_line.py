@@ -9,8 +9,10 @@ import pytest
 
 from capture4d.cli.main import main
 
-PROGRESS = re.compile(r"[\w ,-]+: (begins|(stopped|ends) after [\d:]+|\d+ of \d+(, | in ).*)")
-"""A line about how far the work is, where stderr is not a terminal."""
+PROGRESS = re.compile(
+    r"[\w ,-]+: (begins|(stopped|ends) after [\d:]+|\d+ of \d+(, | in ).*)|capture4d: registration: the cloth is plain .*"
+)
+"""A line about how far the work is, where stderr is not a terminal, or what was decided on the way."""
 
 
 def run(*arguments: str | Path) -> int:

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import registration.stage
+import registration.take
 from benchmarks.dressed_body import dress_body
 from capture4d import pipeline
 from capture4d.app.report import take as report_stage
@@ -115,7 +115,7 @@ class Watch:
 
 def stop_after(frames: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C while the next frame is registered."""
-    plain, count = registration.stage._make_frame, 0
+    plain, count = registration.take._make_frame, 0
 
     def make(*arguments):
         nonlocal count
@@ -124,7 +124,7 @@ def stop_after(frames: int, monkeypatch: pytest.MonkeyPatch) -> None:
         count += 1
         plain(*arguments)
 
-    monkeypatch.setattr(registration.stage, "_make_frame", make)
+    monkeypatch.setattr(registration.take, "_make_frame", make)
 
 
 @pytest.mark.slow
