@@ -10,7 +10,8 @@ import pytest
 from capture4d.cli.main import main
 
 PROGRESS = re.compile(
-    r"[\w ,-]+: (begins|(stopped|ends) after [\d:]+|\d+ of \d+(, | in ).*)|capture4d: registration: the cloth is plain .*"
+    r"[\w ,-]+: (begins|(stopped|ends) after [\d:]+|\d+ of \d+(, | in ).*)"
+    r"|capture4d: registration: the cloth is plain .*"
 )
 """A line about how far the work is, where stderr is not a terminal, or what was decided on the way."""
 
