@@ -388,6 +388,20 @@ def test_a_model_keeps_the_layout_of_its_maps(tmp_path: Path):
     np.testing.assert_array_equal(made.uv, layouts[1])
 
 
+def interrupt_the_fourth_step(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Ctrl-C once, in the fourth step that is begun; gets a number for each."""
+    step, begun = train_stage.train_step, []
+
+    def stopping(*arguments: object) -> dict[str, float]:
+        begun.append(len(begun))
+        if len(begun) == 4:
+            raise KeyboardInterrupt
+        return step(*arguments)  # pyright: ignore
+
+    monkeypatch.setattr(train_stage, "train_step", stopping)
+    return begun
+
+
 @pytest.mark.parametrize("log_every", [2, 3])
 def test_an_interrupted_training_ends_with_the_same_weights(
     work: Path, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, log_every: int
@@ -396,17 +410,8 @@ def test_an_interrupted_training_ends_with_the_same_weights(
         assert run(*train(work, tmp_path / "whole", "--schedule.log-every", "3")) == 0
         trained = tmp_path / "whole"
     more = ("--schedule.log-every", str(log_every))
-    step, done = train_stage.train_step, []
-
-    def stopping(*arguments: object) -> dict[str, float]:
-        done.append(1)
-        if len(done) == 4:
-            raise KeyboardInterrupt
-        return step(*arguments)  # pyright: ignore
-
-    monkeypatch.setattr(train_stage, "train_step", stopping)
+    interrupt_the_fourth_step(monkeypatch)
     assert run(*train(work, tmp_path / "again", *more)) == 130
-    monkeypatch.setattr(train_stage, "train_step", step)
     assert run(*train(work, tmp_path / "again", *more)) == 0
     for name in ("generator.safetensors", "checkpoints/000006.safetensors", "metrics.jsonl", "samples/000006.png"):
         assert (tmp_path / "again" / name).read_bytes() == (trained / name).read_bytes(), name
@@ -416,15 +421,7 @@ def test_a_long_training_is_saved_by_the_clock_too(
     work: Path, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     rarely = ("--schedule.checkpoint-every", "100", "--schedule.checkpoint-s", "0")
-    step, done = train_stage.train_step, []
-
-    def stopping(*arguments: object) -> dict[str, float]:
-        done.append(1)
-        if len(done) == 4:
-            raise KeyboardInterrupt
-        return step(*arguments)  # pyright: ignore
-
-    monkeypatch.setattr(train_stage, "train_step", stopping)
+    done = interrupt_the_fourth_step(monkeypatch)
     assert run(*train(work, tmp_path / "again", *rarely)) == 130
     assert run(*train(work, tmp_path / "again", *rarely)) == 0
     assert len(done) == 4 + 3, "three of the six steps were kept"
