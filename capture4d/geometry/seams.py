@@ -50,11 +50,17 @@ class Welded:
 def weld(vertices: Float[np.ndarray, "V 3"], faces: Integer[np.ndarray, "F 3"]) -> Welded:
     """Join the vertices along seams; what is no seam, and all vertices off the seams, stay as they are."""
     label, against = np.arange(len(vertices)), 0
-    scale = float(np.abs(vertices[faces.reshape(-1)]).max(initial=0.0))
+    is_open, used = open_vertices(np.ascontiguousarray(faces, np.int32), len(vertices))
+    scale = float(np.abs(vertices[used]).max(initial=0.0))
+    sides = _open_sides(faces, is_open)
     for tolerance in (0.0, ROUNDING * scale):
-        pairs, against = _seam_pairs(vertices, label[faces], tolerance)
+        pairs, against = _seam_pairs(vertices, *sides, tolerance)
         if len(pairs):
             label = _joined(label, pairs, faces)
+            joined = label[faces]
+            sides = _open_sides(joined, open_vertices(np.ascontiguousarray(joined, np.int32), len(vertices))[0])
+    if not (label != np.arange(len(label))).any():
+        return Welded(faces.astype(np.int32, copy=False), *(np.arange(len(label), dtype=np.int32),) * 2, against)
     standing, first, of_vertex = np.unique(label, return_index=True, return_inverse=True)
     order = np.argsort(first)
     turn = np.empty(len(standing), np.int32)
@@ -71,10 +77,14 @@ def welded_mesh(mesh: Mesh) -> tuple[Mesh, Welded]:
     return Mesh(mesh.vertices[welded.first], welded.faces, mesh.uv), welded
 
 
-def _open_sides(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Directed edges that belong to one face only, (E, 2), and the third corner of that face."""
-    is_open, _ = open_vertices(np.ascontiguousarray(faces, np.int32), count)
-    near = faces[is_open[faces].sum(axis=1) >= 2]
+def _open_sides(faces: np.ndarray, is_open: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Directed edges that belong to one face only, (E, 2), and the third corner of that face.
+
+    Args:
+        is_open: vertices on open edges.
+    """
+    first, second, third = (is_open[faces[:, corner]] for corner in range(3))
+    near = faces[(first & second) | (second & third) | (third & first)]
     sides = half_edges(near).astype(np.int64)
     third = near[:, [2, 0, 1]].reshape(-1)
     keys = (sides.min(axis=1) << 32) | sides.max(axis=1)
@@ -83,12 +93,15 @@ def _open_sides(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     return sides[alone], third[alone]
 
 
-def _seam_pairs(vertices: np.ndarray, faces: np.ndarray, tolerance: float) -> tuple[Int64[np.ndarray, "pairs 2"], int]:
-    """Vertices to be joined; and how many pairs of edges only their winding keeps apart."""
+def _seam_pairs(
+    vertices: np.ndarray, sides: np.ndarray, third: np.ndarray, tolerance: float
+) -> tuple[Int64[np.ndarray, "pairs 2"], int]:
+    """Vertices to be joined; and how many pairs of edges only their winding keeps apart.
+
+    Args:
+        sides, third: as `_open_sides` has them.
+    """
     nothing = np.zeros((0, 2), np.int64)
-    if not len(faces):
-        return nothing, 0
-    sides, third = _open_sides(faces, len(vertices))
     ends, corner = np.unique(sides, return_inverse=True)
     place = _places(vertices[ends], tolerance)
     if not len(ends) or place.max() + 1 == len(ends):
@@ -132,7 +145,11 @@ def _parts(count: int, links: np.ndarray) -> Int64[np.ndarray, " count"]:
 
 def _joined(label: np.ndarray, pairs: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Labels after joining; where that would make an edge of three faces, or a face with one corner twice, not."""
-    refused = np.zeros(len(label), bool)
+    refused, concerned = np.zeros((2, len(label)), bool)
+    concerned[pairs] = True
+    touched = concerned[label]
+    # no edge of another face changes, and around what is joined all faces are here
+    faces = faces[touched[faces[:, 0]] | touched[faces[:, 1]] | touched[faces[:, 2]]]
     before, uses = edge_uses(label[faces])
     crowded = before[(uses > 2) | (before[:, 0] == before[:, 1])]
     while True:
