@@ -152,7 +152,7 @@ def _dispatch(arguments: list[str]) -> int:
     if getattr(command, "dry_run", False):  # nothing is written: no lock, no log, not even a folder
         with _showing(command), _allowing(command):
             return command()
-    with _showing(command), _allowing(command), _alone(command), _spreading(command):
+    with _showing(command), _allowing(command), _alone(command), _spreading(command), _keeping_workers():
         return _logged(command, arguments)
 
 
@@ -198,6 +198,15 @@ def _spreading(command: Any) -> Iterator[None]:
     from capture4d.runs.cluster.scheduler import use_scheduler
 
     with use_scheduler(address):
+        yield
+
+
+@contextlib.contextmanager
+def _keeping_workers() -> Iterator[None]:
+    """Worker processes go from step to step of the command."""
+    from capture4d.runs.worker_pool import kept_workers
+
+    with kept_workers():
         yield
 
 

@@ -25,6 +25,7 @@ from typing import Any, ParamSpec, TypeVar
 from capture4d.files.atomic import plain_value
 from capture4d.runs.progress import stage_progress
 from capture4d.runs.stage import StageResult
+from capture4d.runs.worker_pool import cpu_of_workers, kept_workers
 
 __all__ = ["FORMER_LOG", "LARGEST_LOG", "LOG", "RunLog", "logged_stage", "run_log"]
 
@@ -127,7 +128,7 @@ def logged_stage(name: str) -> Callable[[Callable[Arguments, Result]], Callable[
         @functools.wraps(function)
         def run(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
             log = _log.get()
-            with stage_progress(name):
+            with stage_progress(name), kept_workers():
                 if log is None:
                     return function(*args, **kwargs)
                 log.write("stage begins", stage=name)
@@ -157,9 +158,9 @@ def _times(begun: float, cpu_s: float) -> Mapping[str, float]:
 
 
 def _cpu_s() -> float:
-    """Of this process, and of its workers that have ended."""
+    """Of this process, and of its workers, ended or kept."""
     times = os.times()
-    return times.user + times.system + times.children_user + times.children_system
+    return times.user + times.system + times.children_user + times.children_system + cpu_of_workers()
 
 
 def _version(name: str) -> str | None:

@@ -1,22 +1,15 @@
-"""A pool of workers that tell how far they are: one thread each, and none outlives the command. They are processes of
-this machine, or those of a cluster (`runs.cluster`)."""
+"""Workers that tell how far they are: one thread each, and none outlives the command. They are processes of this
+machine (`runs.worker_pool`), or those of a cluster (`runs.cluster`)."""
 
 from __future__ import annotations
 
-import contextlib
-import multiprocessing
-import os
-import signal
-import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from functools import partial
-from multiprocessing.connection import wait
 from typing import Any, TypeVar, overload
 
 from capture4d.runs.cluster.scheduler import Cluster, chosen_cluster
 from capture4d.runs.progress import progress
+from capture4d.runs.worker_pool import WorkersLostError, worker_pool
 
 __all__ = ["WorkerDied", "run_jobs", "shared"]
 
@@ -26,7 +19,7 @@ Result = TypeVar("Result")
 
 
 class WorkerDied(RuntimeError):
-    """A worker process ended without an answer: killed, or out of memory. Finished frames are on disk."""
+    """Worker processes ended without an answer: killed, or out of memory. Finished frames are on disk."""
 
 
 def shared(value: Prepared) -> Callable[[], Prepared]:
@@ -80,7 +73,8 @@ def run_jobs(
         units: how much of the progress a job is worth, 1 each if None.
         finished: units done so far, read from disk once a second; for jobs that are worth many.
     Raises:
-        WorkerDied: a worker was killed; of a cluster, every one that did the same job.
+        WorkerDied: a worker was killed, and one of those that took its place; of a cluster, every one that did the
+            same job.
         InputError: there is no cluster where one was chosen, or its workers are not fit.
     """
     if not jobs:
@@ -99,32 +93,17 @@ def run_jobs(
                 advance(units(job) if units else 1)
                 yield result
             return
-        before = set(multiprocessing.active_children())
-        pool = ProcessPoolExecutor(
-            min(workers, len(jobs)),
-            multiprocessing.get_context("spawn"),
-            initializer=_start_worker,
-            initargs=(function, prepare),
-        )
         try:
-            with _worker_environment():
-                futures: dict[Future[Result], Job] = {pool.submit(_work, job): job for job in jobs}
-            for future in as_completed(futures):
-                result = future.result()
-                advance(units(futures[future]) if units else 1)
-                yield result
-        except BaseException as error:
-            for worker in set(multiprocessing.active_children()) - before:
-                worker.kill()  # files are whole or absent, so there is nothing to wait for
-            if isinstance(error, BrokenProcessPool):
-                raise WorkerDied(
-                    f"{label}: a worker process was killed, perhaps for want of memory; finished frames are kept, "
-                    "the same command goes on (with fewer --workers if memory is short). A script of your own must "
-                    "start its work under `if __name__ == '__main__':`"
-                ) from None
-            raise
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+            with worker_pool(workers) as pool:
+                for at, result in pool.run(function, jobs, prepare):
+                    advance(units(jobs[at]) if units else 1)
+                    yield result
+        except WorkersLostError:
+            raise WorkerDied(
+                f"{label}: a worker process was killed, perhaps for want of memory; finished frames are kept, "
+                "the same command goes on (with fewer --workers if memory is short). A script of your own must "
+                "start its work under `if __name__ == '__main__':`"
+            ) from None
 
 
 def _on_cluster(
@@ -140,55 +119,3 @@ def _on_cluster(
         yield from cluster_jobs(cluster, function, jobs, prepare)
     except ClusterLostError as error:
         raise WorkerDied(f"{label}: {error}; finished frames are kept, the same command goes on") from None
-
-
-@contextlib.contextmanager
-def _worker_environment() -> Iterator[None]:
-    """Processes started meanwhile leave Ctrl-C to this one, and compute on one thread.
-
-    Numerical libraries read these variables as they load; an ignored signal is inherited.
-    """
-    variables = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-    before = {name: os.environ.get(name) for name in variables}
-    os.environ.update(dict.fromkeys(variables, "1"))
-    on_main_thread = threading.current_thread() is threading.main_thread()
-    answer = signal.signal(signal.SIGINT, signal.SIG_IGN) if on_main_thread else None
-    try:
-        yield
-    finally:
-        if on_main_thread:
-            signal.signal(signal.SIGINT, answer)
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
-
-
-_function: Callable[..., Any] | None = None
-_prepare: Callable[[], Any] | None = None
-_prepared: tuple[Any, ...] | None = None
-"""Of this process, if it is a worker: it serves one pool, from its start to its end."""
-
-
-def _work(job: Any) -> Any:
-    """Run one job in a worker, which prepares before its first: there, so that a fault travels back as a job's does."""
-    global _prepared
-    if _prepared is None:
-        _prepared = () if _prepare is None else (_prepare(),)
-    assert _function is not None
-    return _function(*_prepared, job)
-
-
-def _start_worker(function: Callable[..., Any], prepare: Callable[[], Any] | None) -> None:
-    """Take the work, and end with the parent, however it ends."""
-    global _function, _prepare
-    _function, _prepare = function, prepare
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def end_with_parent() -> None:
-        wait([parent.sentinel])
-        os._exit(1)
-
-    threading.Thread(target=end_with_parent, daemon=True).start()

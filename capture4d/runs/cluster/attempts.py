@@ -1,8 +1,8 @@
 """Frames that end the worker that does them, for want of memory say: after three of them such a frame is given up.
 
 A worker leaves a note before each frame and removes it when the frame is done, so a note that is found tells of a
-worker that has not come back. Notes are counted on a cluster alone, and of one command: here, a worker that was killed
-ends the command, and whoever pulls the plug three times has said nothing about the frame.
+worker that has not come back. Notes are counted on a cluster alone, and of one command: here, the second worker that is
+killed in a step ends the command, and whoever pulls the plug three times has said nothing about the frame.
 """
 
 from __future__ import annotations
