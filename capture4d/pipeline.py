@@ -21,6 +21,7 @@ from capture4d.captures.work_folder import AnyCapture, AnyWork, Place, opened_ca
 from capture4d.runs.decisions import forget_decisions, take_over_decisions
 from capture4d.runs.run_log import logged_stage
 from capture4d.runs.stage import StageResult
+from capture4d.runs.worker_pool import kept_workers
 from capture4d.synthetic import scan, synth, synth_board
 from capture4d.templates.config import TemplateConfig
 from capture4d.tracking.config import TrackingConfig
@@ -48,18 +49,33 @@ __all__ = [
 
 @logged_stage("extract")
 def extract(
-    capture: AnyCapture, work: AnyWork, *, learn_colours: bool = False, workers: int = 1, overwrite: bool = False
+    capture: AnyCapture,
+    work: AnyWork,
+    *,
+    learn_colours: bool = False,
+    for_tracking: bool | None = None,
+    workers: int = 1,
+    overwrite: bool = False,
 ) -> StageResult:
     """Cut the garment out of every scan by its colour, and find its painted borders: WORK/garment.
 
     Args:
         learn_colours: learn all colours from the scans, not only those that capture.json leaves open.
+        for_tracking: keep what `track` reads of each scan, so that it need not open them; None: if the capture brings
+            no poses.
     """
     from capture4d.extraction.stage import ExtractionSettings
     from capture4d.extraction.stage import run as stage
 
     config = ExtractionSettings(learn_colours=learn_colours)
-    return stage(opened_capture(capture), path_of(work) / "garment", config, workers=workers, overwrite=overwrite)
+    return stage(
+        opened_capture(capture),
+        path_of(work) / "garment",
+        config,
+        workers=workers,
+        overwrite=overwrite,
+        for_tracking=for_tracking,
+    )
 
 
 @logged_stage("track")
@@ -160,13 +176,14 @@ def run(
     tracked = tracked or needs_tracking(opened)
     require_ready(opened, folder, config, tracking if tracked else None, anew=overwrite)
     anew = made_anew(changes(opened, folder, config, tracking=tracking, tracked=tracked)) if overwrite else ()
-    extract(opened, folder, workers=workers, overwrite="extract" in anew)
-    if tracked:
-        track(opened, folder, tracking, workers=workers, overwrite="track" in anew)
-    registered = register(opened, folder, config, tracked=tracked, workers=workers, overwrite="register" in anew)
-    if not draw:
-        return registered
-    page = report(folder, capture=opened, workers=workers, overwrite=overwrite).path
+    with kept_workers():
+        extract(opened, folder, for_tracking=tracked, workers=workers, overwrite="extract" in anew)
+        if tracked:
+            track(opened, folder, tracking, workers=workers, overwrite="track" in anew)
+        registered = register(opened, folder, config, tracked=tracked, workers=workers, overwrite="register" in anew)
+        if not draw:
+            return registered
+        page = report(folder, capture=opened, workers=workers, overwrite=overwrite).path
     return replace(registered, path=page)
 
 

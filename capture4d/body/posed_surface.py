@@ -8,7 +8,8 @@ Letters: V vertices, J joints, S shape components, N matched points, P = 3 + 3 J
 
 A surface point p = sum_k w_k T_k x moves with a turn of joint j about its centre c_j by w x (A_j - W_j c_j), where A_j
 sums w_k T_k x, and W_j sums w_k, over the joints at and below j. One pass up the tree gives all A and W, so a row costs
-as much as the skinning does; automatic differentiation of the same chain took a second.
+as much as the skinning does; automatic differentiation of the same chain took a second. A row has entries for the
+joints above its point alone, so that normal equations are added up row by row, without the rows.
 
 Pose correctives of the SMPL family move the surface but are held constant in the derivative.
 """
@@ -19,22 +20,35 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int32
-from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from capture4d.body.skinning import PosedBody, with_pose, with_shape
+from capture4d.body.skinning import PosedBody, ShapedBody, with_pose
+from capture4d.body.surface_kernels import add_up_rows, fill_rows, nearest_samples, skin_sparse, spread_samples
 from capture4d.geometry.mesh import face_areas
 from capture4d.geometry.mesh_kernels import vertex_normals_kernel
+from capture4d.geometry.point_grid import PointGrid
 from capture4d.geometry.triangles import closest_on_faces
-from capture4d.heavy_imports import njit
 from capture4d.types import Body
 
-__all__ = ["BodyState", "Matches", "PosedSurface", "TrackedBody", "linearise", "match", "pose_surface", "tracked_body"]
+__all__ = [
+    "BodyState",
+    "Matches",
+    "PosedSurface",
+    "TrackedBody",
+    "linearise",
+    "match",
+    "normal_equations",
+    "pose_surface",
+    "tracked_body",
+]
 
 SURFACE_SAMPLES = 8000
 """Points spread over the body by area; they find the faces near a scan point. 15 mm apart on an adult."""
 NORMAL_REACH_M = 0.04
 """A match between opposite normals costs as much as one twice this far away: arms do not match the trunk's side."""
+CELL_M = 0.04
+"""Cells in which samples are looked for: larger ones hold too many, and in smaller ones those who are far off, as while
+a pose is searched for, pass too many that are empty."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,6 +78,12 @@ class TrackedBody:
     shape_directions: Float64[np.ndarray, "verts 3 shapes"]
     sample_faces: Int32[np.ndarray, " samples"]
     sample_barycentric: Float64[np.ndarray, "samples 3"]
+    face_groups: Int32[np.ndarray, " faces"]
+    """Faces of one group are moved by the same joints."""
+    group_starts: Int32[np.ndarray, " groups1"]
+    """Where the joints of each group begin in `group_joints`, and where the last ones end."""
+    group_joints: Int32[np.ndarray, " entries"]
+    """Joints that move a face, those that it has weights of and all above them, children first."""
 
     def rest_state(self) -> BodyState:
         joints, shapes = len(self.body.joint_names), len(self.body.shape_directions)
@@ -100,6 +120,7 @@ def tracked_body(body: Body, *, samples: int = SURFACE_SAMPLES) -> TrackedBody:
     rng = np.random.default_rng(0)
     at = (np.arange(samples) + rng.random(samples)) / samples * areas[-1]
     root, across = np.sqrt(rng.random(samples)), rng.random(samples)
+    groups, starts, members = _groups(body)
     return TrackedBody(
         body=body,
         vertex_joints=order.astype(np.int32),
@@ -107,14 +128,36 @@ def tracked_body(body: Body, *, samples: int = SURFACE_SAMPLES) -> TrackedBody:
         shape_directions=np.ascontiguousarray(np.moveaxis(body.shape_directions, 0, 2), np.float64),
         sample_faces=np.minimum(np.searchsorted(areas, at), len(areas) - 1).astype(np.int32),
         sample_barycentric=np.stack([1 - root, root * (1 - across), root * across], axis=1),
+        face_groups=groups,
+        group_starts=starts,
+        group_joints=members,
     )
+
+
+def _groups(body: Body) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The groups of the faces, and their joints."""
+    moves = (body.skin_weights > 0)[body.template.faces].any(axis=1)
+    for joint in range(len(body.parents) - 1, 0, -1):  # parents come before their children
+        moves[:, body.parents[joint]] |= moves[:, joint]
+    sets, groups = np.unique(moves, axis=0, return_inverse=True)
+    group, joint = np.nonzero(sets[:, ::-1])
+    starts = np.searchsorted(group, np.arange(len(sets) + 1))
+    members = len(body.parents) - 1 - joint
+    return groups.reshape(-1).astype(np.int32), starts.astype(np.int32), members.astype(np.int32)
 
 
 def pose_surface(model: TrackedBody, state: BodyState) -> PosedSurface:
     """Skin the body."""
-    posed = with_pose(with_shape(model.body, state.shape), state.rotations, state.translation)
-    vertices = _skin(_rest(model, posed), model.vertex_joints, model.vertex_weights, posed.transforms)
+    posed = with_pose(_shaped(model, state.shape), state.rotations, state.translation)
+    vertices = skin_sparse(_rest(model, posed), model.vertex_joints, model.vertex_weights, posed.transforms)
     return PosedSurface(model, posed, vertices, vertex_normals_kernel(vertices, model.body.template.faces))
+
+
+def _shaped(model: TrackedBody, shape: np.ndarray) -> ShapedBody:
+    """`skinning.with_shape`, of directions that are float64 already: converting them would take longest."""
+    body = model.body
+    joints = body.joints + np.tensordot(shape, body.joint_directions, axes=1)
+    return ShapedBody(body, shape, body.template.vertices + model.shape_directions @ shape, joints)
 
 
 def _rest(model: TrackedBody, posed: PosedBody) -> np.ndarray:
@@ -137,32 +180,62 @@ def match(
         normals: of the scan, outwards; zero where unknown.
         faces: candidates to look at for each point.
     """
-    model = surface.model
-    corners = model.body.template.faces[model.sample_faces]
-    weights = model.sample_barycentric[:, :, None]
-    places = (surface.vertices[corners] * weights).sum(axis=1)
-    directions = (surface.normals[corners] * weights).sum(axis=1)
-    tree = KDTree(np.hstack([places, NORMAL_REACH_M * directions]), balanced_tree=False, compact_nodes=False)
-    _, nearest = tree.query(np.hstack([points, NORMAL_REACH_M * normals]), k=faces)
-    candidates = model.sample_faces[nearest.reshape(len(points), faces)]
-    face, barycentric = closest_on_faces(points, candidates, surface.vertices, model.body.template.faces)
-    on_body, outward = _interpolate(surface.vertices, surface.normals, model.body.template.faces, face, barycentric)
-    return Matches(on_body, outward, face, barycentric)
+    model, all_faces = surface.model, surface.model.body.template.faces
+    places, directions = spread_samples(
+        surface.vertices, surface.normals, all_faces, model.sample_faces, model.sample_barycentric
+    )
+    grid = PointGrid.build(places, CELL_M)
+    nearest = nearest_samples(
+        np.ascontiguousarray(points), np.ascontiguousarray(normals), faces, NORMAL_REACH_M,
+        grid.origin, grid.cell, grid.shape, grid.starts, grid.points, directions[grid.order],
+    )  # fmt: skip
+    candidates = model.sample_faces[grid.order[nearest]]
+    face, barycentric = closest_on_faces(points, candidates, surface.vertices, all_faces)
+    on_body, outward = spread_samples(surface.vertices, surface.normals, all_faces, face, barycentric)
+    return Matches(on_body, outward / np.maximum(np.linalg.norm(outward, axis=1), 1e-300)[:, None], face, barycentric)
 
 
 def linearise(
     surface: PosedSurface, matches: Matches, active: Bool[np.ndarray, " points"]
 ) -> Float64[np.ndarray, "active parameters"]:
     """Derivative of n . p with respect to all parameters for the active matches, their normals held."""
+    own = (matches.faces[active], matches.barycentric[active], np.ascontiguousarray(matches.normals[active]))
+    return fill_rows(*own, *_tree(surface))
+
+
+def normal_equations(
+    surface: PosedSurface,
+    matches: Matches,
+    weight: Float64[np.ndarray, " points"],
+    residual: Float64[np.ndarray, " points"],
+    *,
+    with_shape: bool = True,
+) -> tuple[Float64[np.ndarray, "parameters parameters"], Float64[np.ndarray, " parameters"]]:
+    """J^T W J and J^T W r, with the rows of `linearise` as J.
+
+    Args:
+        weight: zero leaves a point out.
+        residual: by which the surface is to move along its normals, metres.
+        with_shape: False leaves the parameters of the shape out.
+    """
+    kept = np.flatnonzero(weight)
+    order = kept[np.argsort(surface.model.face_groups[matches.faces[kept]], kind="stable")]
+    normals = np.ascontiguousarray(matches.normals)
+    return add_up_rows(
+        order, weight, residual, with_shape, matches.faces, matches.barycentric, normals, *_tree(surface)
+    )
+
+
+def _tree(surface: PosedSurface) -> tuple[np.ndarray, ...]:
+    """What rows are made of beside their points."""
     model, posed = surface.model, surface.posed
     centres, offsets = _centres_and_shape_offsets(model.body, posed)
-    world = posed.transforms[:, :3, :3]
-    parents = model.body.parents
+    world, parents = posed.transforms[:, :3, :3], model.body.parents
     parent_world = np.where((parents < 0)[:, None, None], np.eye(3), world[np.maximum(parents, 0)])
-    return _rows(
-        matches.faces[active],
-        matches.barycentric[active],
-        np.ascontiguousarray(matches.normals[active]),
+    return (
+        model.face_groups,
+        model.group_starts,
+        model.group_joints,
         model.body.template.faces,
         _rest(model, posed),
         model.vertex_joints,
@@ -187,86 +260,3 @@ def _centres_and_shape_offsets(body: Body, posed: PosedBody) -> tuple[np.ndarray
         parent = body.parents[joint]
         moved[joint] = moved[parent] + world[parent] @ (at_rest[joint] - at_rest[parent])
     return centres, moved - world @ at_rest
-
-
-@njit(cache=True)
-def _skin(rest, joints, weights, transforms):
-    result = np.zeros((len(rest), 3))
-    for v in range(len(rest)):
-        for k in range(joints.shape[1]):
-            w = weights[v, k]
-            if w == 0.0:
-                break
-            T = transforms[joints[v, k]]
-            for a in range(3):
-                result[v, a] += w * (T[a, 0] * rest[v, 0] + T[a, 1] * rest[v, 1] + T[a, 2] * rest[v, 2] + T[a, 3])
-    return result
-
-
-@njit(cache=True)
-def _rows(
-    faces_of, barycentric, normals, faces, rest, joints, weights, directions, transforms, centres, offsets,
-    parent_world, parents,
-):  # fmt: skip
-    count, joint_count, shape_count = len(faces_of), len(parents), offsets.shape[2]
-    rows = np.zeros((count, 3 + 3 * joint_count + shape_count))
-    moment = np.zeros((joint_count, 3))
-    share = np.zeros(joint_count)
-    first_shape = 3 + 3 * joint_count
-    for i in range(count):
-        moment[:] = 0.0
-        share[:] = 0.0
-        nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
-        rows[i, 0], rows[i, 1], rows[i, 2] = nx, ny, nz
-        for corner in range(3):
-            v = faces[faces_of[i], corner]
-            for k in range(joints.shape[1]):
-                w = weights[v, k] * barycentric[i, corner]
-                if weights[v, k] == 0.0:
-                    break
-                j = joints[v, k]
-                T = transforms[j]
-                for a in range(3):
-                    place = T[a, 0] * rest[v, 0] + T[a, 1] * rest[v, 1] + T[a, 2] * rest[v, 2] + T[a, 3]
-                    moment[j, a] += w * place
-                share[j] += w
-                bx = w * (T[0, 0] * nx + T[1, 0] * ny + T[2, 0] * nz)
-                by = w * (T[0, 1] * nx + T[1, 1] * ny + T[2, 1] * nz)
-                bz = w * (T[0, 2] * nx + T[1, 2] * ny + T[2, 2] * nz)
-                for s in range(shape_count):
-                    rows[i, first_shape + s] += (
-                        bx * directions[v, 0, s] + by * directions[v, 1, s] + bz * directions[v, 2, s]
-                        + w * (nx * offsets[j, 0, s] + ny * offsets[j, 1, s] + nz * offsets[j, 2, s])
-                    )  # fmt: skip
-        for j in range(joint_count - 1, -1, -1):
-            if share[j] == 0.0:
-                continue
-            ax = moment[j, 0] - share[j] * centres[j, 0]
-            ay = moment[j, 1] - share[j] * centres[j, 1]
-            az = moment[j, 2] - share[j] * centres[j, 2]
-            tx, ty, tz = ay * nz - az * ny, az * nx - ax * nz, ax * ny - ay * nx
-            R = parent_world[j]
-            for a in range(3):
-                rows[i, 3 + 3 * j + a] = R[0, a] * tx + R[1, a] * ty + R[2, a] * tz
-            if parents[j] >= 0:
-                share[parents[j]] += share[j]
-                for a in range(3):
-                    moment[parents[j], a] += moment[j, a]
-    return rows
-
-
-@njit(cache=True)
-def _interpolate(vertices, normals, faces, face_of, barycentric):
-    points = np.zeros((len(face_of), 3))
-    outward = np.zeros((len(face_of), 3))
-    for i in range(len(face_of)):
-        for corner in range(3):
-            v = faces[face_of[i], corner]
-            for a in range(3):
-                points[i, a] += barycentric[i, corner] * vertices[v, a]
-                outward[i, a] += barycentric[i, corner] * normals[v, a]
-        length = np.sqrt(outward[i, 0] ** 2 + outward[i, 1] ** 2 + outward[i, 2] ** 2)
-        if length > 0.0:
-            for a in range(3):
-                outward[i, a] /= length
-    return points, outward

@@ -35,9 +35,16 @@ DAMAGED = "damaged"
 
 
 @contextmanager
-def scan_looked_at(capture: Capture, frame_id: int) -> Iterator[list[FileState]]:
-    """Read a frame's scan inside; what was read of it stands in the list afterwards, also where reading failed."""
-    looked: list[FileState] = []
+def scan_looked_at(capture: Capture, frame_id: int, *, known: Sequence[FileState] = ()) -> Iterator[list[FileState]]:
+    """Read a frame's scan inside; what was read of it stands in the list afterwards, also where reading failed.
+
+    Args:
+        known: what there is to be said of the scan, if it need not be read.
+    """
+    looked: list[FileState] = [*known]
+    if known:
+        yield looked
+        return
     path = scan_path(capture, frame_id)
     own = file_state(path, path.name)  # before it is read: what is changed meanwhile is read again next time
     with companions_named() as named:

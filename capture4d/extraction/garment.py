@@ -74,6 +74,7 @@ def extract_garment(
     other_colours: tuple[Colour, ...] = (),
     printed: bool = False,
     as_scanned: UInt8[np.ndarray, "verts 3"] | None = None,
+    settled: UInt8[np.ndarray, " verts"] | None = None,
     source: str = "scan",
 ) -> GarmentScan:
     """Cut the garment out of a scan.
@@ -84,6 +85,7 @@ def extract_garment(
         other_colours: sRGB of what else there is, where it is known: suit, skin.
         printed: the garment has many colours, of which `garment_colour` is but one: it is what lies between the paint.
         as_scanned: sRGB that the garment keeps, if the scan's are changed.
+        settled: the scan's labels by these colours, as `label_scan` has them, if they are known already.
         source: how errors call the scan, usually its path.
     Raises:
         ColourNotFoundError: the garment's or a border's colour is not in the scan.
@@ -92,9 +94,10 @@ def extract_garment(
     labels = classify_colours(scan.colours, garment_colour, paints, others=other_colours)
     _require_colours(labels, None if printed else garment_colour, paints, source)
     faces = scan.mesh.faces
-    labels = settle_labels(faces, labels)
-    if printed:
-        labels = label_print(faces, labels)
+    if settled is None:
+        settled = settle_labels(faces, labels)
+        settled = label_print(faces, settled) if printed else settled
+    labels = settled
     mask = _garment_faces(faces, labels)
     if not mask.any():
         raise ColourNotFoundError(
@@ -242,7 +245,8 @@ def _across_the_paint(mesh: Mesh, labels: np.ndarray) -> _Band:
     """The way from garment colour across the paint, along the surface: a cuff may touch the flank."""
     is_open, _ = open_vertices(mesh.faces, len(mesh.vertices))
     painted = labels >= FIRST_PAINT
-    local, renumbered = np.unique(mesh.faces[painted[mesh.faces].any(axis=1)], return_inverse=True)
+    near = painted[mesh.faces[:, 0]] | painted[mesh.faces[:, 1]] | painted[mesh.faces[:, 2]]
+    local, renumbered = np.unique(mesh.faces[near], return_inverse=True)
     corners = renumbered.reshape(-1, 3)
     pairs = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
     keys = np.unique(pairs[:, 0].astype(np.int64) * len(local) + pairs[:, 1])
@@ -264,14 +268,24 @@ def _loops_of_paints(boundary_colours: Mapping[str, Colour], paints: tuple[Colou
     return np.array([colours.index(paint) if colours.count(paint) == 1 else -1 for paint in paints], np.int32)
 
 
-def cut_out(scan: Scan, colours: KnownColours, *, source: str = "scan") -> GarmentScan:
+def cut_out(
+    scan: Scan,
+    colours: KnownColours,
+    *,
+    flat: Scan | None = None,
+    settled: UInt8[np.ndarray, " verts"] | None = None,
+    source: str = "scan",
+) -> GarmentScan:
     """The garment of one scan of the take.
 
+    Args:
+        flat: the scan in the light that the colours hold for, and ...
+        settled: ... its labels, if they are known already.
     Raises:
         ColourNotFoundError: the scan is sound, but the garment or a paint is not in it.
     """
     garment = extract_garment(
-        colours.flat(scan), colours.garment, colours.boundary,
+        colours.flat(scan) if flat is None else flat, colours.garment, colours.boundary, settled=settled,
         other_colours=colours.others, printed=colours.printed, as_scanned=scan.colours, source=source,
     )  # fmt: skip
     if colours.light is None:

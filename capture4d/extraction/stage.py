@@ -6,10 +6,13 @@ them, because the subject has left the volume or hides a border, and any frame w
 instead of a garment, and registration flags it. Damaged scans are read again in every run, in case they were repaired.
 
 A frame is made from its scan, the colours, and the unit of the scans.
+
+While a scan is open, what `track` reads of it is kept as well, where there are no poses (`captures.scan_points`).
 """
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +22,8 @@ import numpy as np
 
 from capture4d.captures.capture import Capture, read_frame, scan_path
 from capture4d.captures.garment_scans import ESTIMATED, save_garment_scan
+from capture4d.captures.sampling import SamplingConfig
+from capture4d.captures.scan_points import KeptPoints, ScanPoints, label_scan, scan_points
 from capture4d.captures.scan_states import (
     DAMAGED,
     replaced_scan,
@@ -75,9 +80,12 @@ def run(
     *,
     workers: int = 1,
     overwrite: bool = False,
+    for_tracking: bool | None = None,
 ) -> StageResult:
     """Extract the garment of every frame that has none yet, or has that of another scan, or of other colours.
 
+    Args:
+        for_tracking: keep the points that `track` reads of a scan as well; None: if the capture brings no poses.
     Raises:
         InputError: a scan is missing, none can be read, or the first that can lack the garment's colours; or these are
             to be learned and are not separable.
@@ -105,7 +113,9 @@ def run(
             say(f"{output.name}: the colours are kept as frames {taken.frames} gave them; "
                 "--renew colours learns them anew")  # fmt: skip
         try:
-            _extract(_Extraction(capture, taken.colours, output, inputs), stage, pending.frames, workers)
+            keeps = for_tracking if for_tracking is not None else not (capture.path / "poses.npz").is_file()
+            points = KeptPoints.of(output.parent, capture, taken.colours, SamplingConfig()) if keeps else None
+            _extract(_Extraction(capture, taken.colours, output, inputs, points), stage, pending.frames, workers)
         except InputError:
             if taken.newly:  # nothing was made with them
                 (output / COLOURS).unlink(missing_ok=True)
@@ -190,6 +200,8 @@ class _Extraction:
     colours: KnownColours
     folder: Path
     inputs: Mapping[str, str]
+    points: KeptPoints | None
+    """Where what tracking reads is kept; None keeps none."""
 
 
 def _extract(take: _Extraction, stage: GrowingStage, pending: Sequence[int], workers: int) -> None:
@@ -228,10 +240,18 @@ def _extract_first(take: _Extraction, stage: GrowingStage, pending: Sequence[int
     raise (absent or damaged)[0]
 
 
-def extract_frame(capture: Capture, colours: KnownColours, frame_id: int) -> tuple[GarmentScan, bool]:
-    """Read one scan and cut its garment out; and whether the scan's faces are estimated."""
-    scan, estimated = read_frame(capture, frame_id)
-    return cut_out(scan, colours, source=str(scan_path(capture, frame_id))), estimated
+def extract_frame(take: _Extraction, frame_id: int) -> tuple[GarmentScan, bool, ScanPoints | None]:
+    """Read one scan and cut its garment out; whether the scan's faces are estimated; and the points to be kept."""
+    source = str(scan_path(take.capture, frame_id))
+    scan, estimated = read_frame(take.capture, frame_id)
+    flat = take.colours.flat(scan)
+    labels = label_scan(flat, take.colours)
+    garment = cut_out(scan, take.colours, flat=flat, settled=labels, source=source)
+    points = None
+    if take.points is not None:
+        with contextlib.suppress(InputError):  # that there are none is for `track` to say
+            points = scan_points(flat, labels, SamplingConfig(), source=source)
+    return garment, estimated, points
 
 
 def write_frame(take: _Extraction, frame_id: int, *, keep_faults: bool = True) -> InputError | None:
@@ -243,11 +263,11 @@ def write_frame(take: _Extraction, frame_id: int, *, keep_faults: bool = True) -
         Why there is no garment.
     """
     path = take.folder / "frames" / f"{frame_id:06d}.npz"
-    fault, found, estimated = None, None, False
+    fault, found, estimated, points = None, None, False, None
     with scan_looked_at(take.capture, frame_id) as looked:
         try:
             begin_frame(path)
-            found, estimated = extract_frame(take.capture, take.colours, frame_id)
+            found, estimated, points = extract_frame(take, frame_id)
         except InputError as error:
             fault = error
     said: dict[str, Any] = {ESTIMATED: True} if estimated else {}
@@ -263,6 +283,8 @@ def write_frame(take: _Extraction, frame_id: int, *, keep_faults: bool = True) -
             save_garment_scan(path, found, estimated=estimated)
 
     inputs = {**take.inputs, "scan": scan_digest(looked)}
+    if take.points is not None and points is not None:
+        take.points.write(frame_id, points, looked)
     make(take.folder, path, write, inputs=inputs, files=looked, said=said)
     end_frame(path)
     return fault

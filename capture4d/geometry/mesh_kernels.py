@@ -10,7 +10,15 @@ import numpy as np
 
 from capture4d.heavy_imports import njit
 
-__all__ = ["face_components", "laplacian_pass", "mean_edge_length", "open_vertices", "vertex_normals_kernel"]
+__all__ = [
+    "face_components",
+    "first_in_cells",
+    "laplacian_pass",
+    "mean_edge_length",
+    "normals_of_some",
+    "open_vertices",
+    "vertex_normals_kernel",
+]
 
 
 @njit(cache=True)
@@ -96,6 +104,62 @@ def vertex_normals_kernel(positions, faces):
             result[v, 1] /= length
             result[v, 2] /= length
     return result
+
+
+@njit(cache=True)
+def normals_of_some(positions, faces, some):
+    """Area-weighted unit normals of some vertices, (len(some), 3); zero where there is no area."""
+    place = np.full(len(positions), -1)
+    for n in range(len(some)):
+        place[some[n]] = n
+    result = np.zeros((len(some), 3))
+    for f in range(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        if place[a] < 0 and place[b] < 0 and place[c] < 0:
+            continue
+        ox, oy, oz = np.float64(positions[a, 0]), np.float64(positions[a, 1]), np.float64(positions[a, 2])
+        ux, uy, uz = positions[b, 0] - ox, positions[b, 1] - oy, positions[b, 2] - oz
+        wx, wy, wz = positions[c, 0] - ox, positions[c, 1] - oy, positions[c, 2] - oz
+        nx, ny, nz = uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx
+        for v in (a, b, c):
+            n = place[v]
+            if n >= 0:
+                result[n, 0] += nx
+                result[n, 1] += ny
+                result[n, 2] += nz
+    for n in range(len(some)):
+        length = np.sqrt(result[n, 0] ** 2 + result[n, 1] ** 2 + result[n, 2] ** 2)
+        if length > 0.0:
+            for axis in range(3):
+                result[n, axis] /= length
+    return result
+
+
+@njit(cache=True)
+def first_in_cells(positions, candidates, size):
+    """Of some vertices the first one in every cell of a grid, in their order.
+
+    Args:
+        size: edge of a cell. Cells that are 2^21 apart along an axis count as one.
+    """
+    slots = 16
+    while slots < 2 * len(candidates):
+        slots *= 2
+    keys, taken = np.empty(slots, np.int64), np.zeros(slots, np.bool_)
+    kept, count = np.empty(len(candidates), candidates.dtype), 0
+    for n in range(len(candidates)):
+        v = candidates[n]
+        key = np.int64(0)
+        for axis in range(3):
+            key = (key << 21) | (np.int64(np.floor(np.float64(positions[v, axis]) / size)) & 0x1FFFFF)
+        slot = ((key * np.int64(-7046029254386353131)) >> 20) & (slots - 1)
+        while taken[slot] and keys[slot] != key:
+            slot = (slot + 1) & (slots - 1)
+        if not taken[slot]:
+            taken[slot], keys[slot] = True, key
+            kept[count] = v
+            count += 1
+    return kept[:count]
 
 
 @njit(cache=True)

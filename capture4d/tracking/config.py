@@ -4,19 +4,10 @@ from __future__ import annotations
 
 from dataclasses import field
 
+from capture4d.captures.sampling import SamplingConfig
 from capture4d.settings import Cosine, Count, NonNegative, Positive, Share, Whole, settings
 
-__all__ = ["ColdStartConfig", "FitConfig", "SamplingConfig", "Schedule", "SequenceConfig", "TrackingConfig"]
-
-
-@settings
-class SamplingConfig:
-    """How many points a scan gives."""
-
-    body_cell_m: Positive = 0.016
-    """One point per cell of this size on skin and suit."""
-    cloth_cell_m: Positive = 0.028
-    """The same on the garment."""
+__all__ = ["ColdStartConfig", "FitConfig", "Schedule", "SequenceConfig", "TrackingConfig"]
 
 
 @settings
@@ -30,7 +21,7 @@ class Schedule:
     last_scale_m: Positive = 0.015
     """... and in the end."""
     stop_m: NonNegative = 1e-4
-    """The fit is done once no step moves anything farther than this."""
+    """The fit is done once no step that looks at all points moves anything farther than this."""
 
 
 @settings
@@ -58,6 +49,8 @@ class FitConfig:
     """Overshoot of a joint limit that weighs as much as one standard deviation."""
     shape_spread: Positive = 1.0
     """Standard deviation of the shape coefficients before any scan."""
+    few_points: Count = 1500
+    """Points of a scan that the first steps of a fit look at: the last two, to which they only lead, look at all."""
 
 
 @settings
@@ -101,7 +94,7 @@ class SequenceConfig:
     """Of a frame that starts from the one before."""
     retry: Schedule = Schedule(iterations=15, first_scale_m=0.12, last_scale_m=0.015)
     """Of a frame that this did not fit."""
-    refine: Schedule = Schedule(iterations=3, first_scale_m=0.02, last_scale_m=0.015)
+    refine: Schedule = Schedule(iterations=2, first_scale_m=0.02, last_scale_m=0.015)
     """Of the second pass, with the one shape of the take."""
     momentum: Share = 0.9
     """Share of the last motion that is expected to go on."""

@@ -19,12 +19,16 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.linalg import cho_factor, cho_solve
 
-from capture4d.body.posed_surface import BodyState, Matches, TrackedBody, linearise, match, pose_surface
+from capture4d.body.posed_surface import BodyState, Matches, TrackedBody, match, normal_equations, pose_surface
+from capture4d.captures.scan_points import ScanPoints, subsample
 from capture4d.tracking.config import FitConfig, Schedule
 from capture4d.tracking.joint_prior import JointPrior, limit_terms, pull_terms
-from capture4d.tracking.scan_points import ScanPoints
 
 __all__ = ["Expectation", "Fit", "fit_body"]
+
+WHOLE_STEPS = 2
+"""Last steps of a fit that look at all points. With one, joints were 2 % farther off, and those farthest off 15 %
+(`python -m benchmarks tracking`)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,25 +83,24 @@ def fit_body(
     size = pose if fixed_shape else pose + len(start.shape)
     information, distances = np.zeros((size, size)), np.zeros(0)
     ratio = schedule.last_scale_m / schedule.first_scale_m
+    damping = np.full(size, 1 / config.shape_step**2)
+    damping[:pose] = 1 / config.turn_step**2
+    few, settled = subsample(scan, config.few_points), False
     for step in range(schedule.iterations):
+        whole = settled or step >= schedule.iterations - WHOLE_STEPS
+        looked_at = scan if whole else few
         scale = schedule.first_scale_m * ratio ** (step / max(schedule.iterations - 1, 1))
         surface = pose_surface(model, state)
-        matches = match(surface, scan.points, scan.normals)
-        residual, weight, distances = _weigh(scan, matches, scale, config)
-        active = weight > 1e-6
-        rows = linearise(surface, matches, active)[:, :size]
-        weighted = rows * weight[active, None]
+        matches = match(surface, looked_at.points, looked_at.normals)
+        residual, weight, distances = _weigh(looked_at, matches, scale, config)
         information, descent = _prior_terms(state, prior, expectation, config, size)
-        information += rows.T @ weighted
-        descent += weighted.T @ residual[active]
-        damping = np.full(size, 1 / config.shape_step**2)
-        damping[:pose] = 1 / config.turn_step**2
-        change = cho_solve(cho_factor(information + np.diag(damping)), descent)
-        moved = state.moved(change)
-        if _largest_motion(model, change) < schedule.stop_m:
-            state = moved
+        seen, pull = normal_equations(surface, matches, weight, residual, with_shape=not fixed_shape)
+        information += seen
+        change = cho_solve(cho_factor(information + np.diag(damping)), descent + pull)
+        state = state.moved(change)
+        settled = _largest_motion(model, change) < schedule.stop_m
+        if settled and looked_at is scan:
             break
-        state = moved
     return Fit(state, distances, information)
 
 

@@ -58,7 +58,7 @@ from capture4d.types import PoseSequence
 
 __all__ = ["changes", "run"]
 
-SCHEMA = 6
+SCHEMA = 7
 NAME = "track"
 
 

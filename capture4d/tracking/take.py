@@ -10,6 +10,7 @@ import numpy as np
 
 from capture4d.body.posed_surface import BodyState
 from capture4d.captures.capture import Capture, read_scan, scan_path
+from capture4d.captures.scan_points import KeptPoints, ScanPoints, label_scan, scan_points
 from capture4d.captures.scan_states import scan_looked_at
 from capture4d.captures.segments import Segment, cut
 from capture4d.captures.take_colours import KnownColours, described_colours
@@ -24,7 +25,6 @@ from capture4d.runs.frame_lists import listed
 from capture4d.runs.growing import GrowingStage, Reads
 from capture4d.runs.made import FileState, Made, digest_of
 from capture4d.tracking.config import TrackingConfig
-from capture4d.tracking.scan_points import ScanPoints, scan_points
 from capture4d.tracking.sequence import Followed, Quality, Tracker, joint_shape
 
 __all__ = [
@@ -77,7 +77,7 @@ class TrackedTake:
         body = self.stage.ledger.of(self.stage.path / "body.npz")
         assert body is not None
         colours = described_colours(self.colours)
-        seen = [colours["garment_colour"], self.paints, colours["light"]]
+        seen = [colours["garment_colour"], self.paints, colours["light"], colours["other_colours"]]
         seen += ["printed"] if self.colours.printed else []
         shared = reads_of(self.capture, self.config).shared
         return digest_of([self.config, self.capture.units, seen, body.digest, shared.get("start")])
@@ -89,19 +89,22 @@ class TrackedTake:
         Args:
             path: of the file that is made from it.
         """
-        fault = ""
+        fault, known = "", KeptPoints.of(self.stage.path.parent, self.capture, self.colours, self.config.sampling)
         points = ScanPoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, bool))
-        with scan_looked_at(self.capture, frame_id) as looked:
+        kept = known.read(frame_id)
+        with scan_looked_at(self.capture, frame_id, known=() if kept is None else kept[1]) as looked:
             try:
                 begin_frame(path)
-                scan = self.colours.flat(read_scan(self.capture, frame_id))
-                source = str(scan_path(self.capture, frame_id))
-                points = scan_points(
-                    scan, self.colours.garment, self.paints, self.config.sampling,
-                    printed=self.colours.printed, source=source,
-                )  # fmt: skip
+                if kept is not None:
+                    points = kept[0]
+                else:
+                    scan = self.colours.flat(read_scan(self.capture, frame_id))
+                    source = str(scan_path(self.capture, frame_id))
+                    points = scan_points(scan, label_scan(scan, self.colours), self.config.sampling, source=source)
             except InputError as error:
                 fault = str(error)
+        if kept is None and not fault:
+            known.write(frame_id, points, looked)
         return points, fault, looked
 
 

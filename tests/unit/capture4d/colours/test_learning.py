@@ -12,6 +12,8 @@ import pytest
 
 from capture4d.captures.capture import read_capture, read_scan, scan_path
 from capture4d.captures.garment_scans import load_garment_scan
+from capture4d.captures.sampling import SamplingConfig
+from capture4d.captures.scan_points import ScanPoints, label_scan, scan_points
 from capture4d.captures.take_colours import take_colours
 from capture4d.colours.learning import ColoursNotSeparableError, fit_light, learn_colours
 from capture4d.colours.spaces import encode_colours, linear_colours
@@ -19,8 +21,6 @@ from capture4d.extraction.garment import extract_garment
 from capture4d.extraction.stage import ExtractionSettings, run
 from capture4d.geometry.mesh import vertex_normals
 from capture4d.mesh_files.meshes import read_coloured_mesh
-from capture4d.tracking.config import SamplingConfig
-from capture4d.tracking.scan_points import ScanPoints, scan_points
 from capture4d.types import Mesh, Scan
 from tests.shapes import tube_faces
 
@@ -221,8 +221,8 @@ def test_tracking_sees_the_same_cloth_without_colours(tube_capture: Path) -> Non
     def points() -> ScanPoints:
         capture = read_capture(tube_capture)
         colours = take_colours(capture)
-        paints = tuple(dict.fromkeys(colours.boundary.values()))
-        return scan_points(colours.flat(read_scan(capture, 6)), colours.garment, paints, SamplingConfig(), source="6")
+        flat = colours.flat(read_scan(capture, 6))
+        return scan_points(flat, label_scan(flat, colours), SamplingConfig(), source="6")
 
     given = points()
     without_colours(tube_capture)
