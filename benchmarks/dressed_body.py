@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from capture4d.body.skinning import PosedBody
-from capture4d.captures.scan_points import ScanPoints
+from capture4d.captures.points.scan_points import ScanPoints
 from capture4d.geometry.mesh import doubled_area_vectors, face_areas, normalised, vertex_normals
 from capture4d.types import Body, Mesh
 

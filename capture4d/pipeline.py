@@ -19,9 +19,9 @@ from capture4d.app.status.work_folders import plan as plan
 from capture4d.calibration.config import CalibrationConfig, RigCheckConfig
 from capture4d.captures.work_folder import AnyCapture, AnyWork, Place, opened_capture, opened_work, path_of
 from capture4d.runs.decisions import forget_decisions, take_over_decisions
+from capture4d.runs.processes.pool import kept_workers
 from capture4d.runs.run_log import logged_stage
 from capture4d.runs.stage import StageResult
-from capture4d.runs.worker_pool import kept_workers
 from capture4d.synthetic import scan, synth, synth_board
 from capture4d.templates.config import TemplateConfig
 from capture4d.tracking.config import TrackingConfig

@@ -204,7 +204,7 @@ def _spreading(command: Any) -> Iterator[None]:
 @contextlib.contextmanager
 def _keeping_workers() -> Iterator[None]:
     """Worker processes go from step to step of the command."""
-    from capture4d.runs.worker_pool import kept_workers
+    from capture4d.runs.processes.pool import kept_workers
 
     with kept_workers():
         yield

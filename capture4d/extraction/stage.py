@@ -7,7 +7,7 @@ instead of a garment, and registration flags it. Damaged scans are read again in
 
 A frame is made from its scan, the colours, and the unit of the scans.
 
-While a scan is open, what `track` reads of it is kept as well, where there are no poses (`captures.scan_points`).
+While a scan is open, what `track` reads of it is kept as well, where there are no poses (`captures.points`).
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ import numpy as np
 
 from capture4d.captures.capture import Capture, read_frame, scan_path
 from capture4d.captures.garment_scans import ESTIMATED, save_garment_scan
-from capture4d.captures.sampling import SamplingConfig
-from capture4d.captures.scan_points import KeptPoints, ScanPoints, label_scan, scan_points
+from capture4d.captures.points.sampling import SamplingConfig
+from capture4d.captures.points.scan_points import KeptPoints, ScanPoints, label_scan, scan_points
 from capture4d.captures.scan_states import (
     DAMAGED,
     replaced_scan,

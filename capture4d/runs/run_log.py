@@ -23,9 +23,9 @@ from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 from capture4d.files.atomic import plain_value
+from capture4d.runs.processes.pool import cpu_of_workers, kept_workers
 from capture4d.runs.progress import stage_progress
 from capture4d.runs.stage import StageResult
-from capture4d.runs.worker_pool import cpu_of_workers, kept_workers
 
 __all__ = ["FORMER_LOG", "LARGEST_LOG", "LOG", "RunLog", "logged_stage", "run_log"]
 

@@ -1,5 +1,5 @@
 """Workers that tell how far they are: one thread each, and none outlives the command. They are processes of this
-machine (`runs.worker_pool`), or those of a cluster (`runs.cluster`)."""
+machine (`runs.processes.pool`), or those of a cluster (`runs.cluster`)."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from functools import partial
 from typing import Any, TypeVar, overload
 
 from capture4d.runs.cluster.scheduler import Cluster, chosen_cluster
+from capture4d.runs.processes.pool import WorkersLostError, worker_pool
 from capture4d.runs.progress import progress
-from capture4d.runs.worker_pool import WorkersLostError, worker_pool
 
 __all__ = ["WorkerDied", "run_jobs", "shared"]
 

@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from capture4d.body.posed_surface import BodyState, TrackedBody, match, pose_surface, tracked_body
 from capture4d.body.skinning import with_pose, with_shape
-from capture4d.captures.scan_points import ScanPoints, subsample
+from capture4d.captures.points.scan_points import ScanPoints, subsample
 from capture4d.tracking.config import ColdStartConfig, FitConfig, Schedule
 from capture4d.tracking.fit import Fit, fit_body
 from capture4d.tracking.joint_prior import JointPrior

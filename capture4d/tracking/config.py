@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import field
 
-from capture4d.captures.sampling import SamplingConfig
+from capture4d.captures.points.sampling import SamplingConfig
 from capture4d.settings import Cosine, Count, NonNegative, Positive, Share, Whole, settings
 
 __all__ = ["ColdStartConfig", "FitConfig", "Schedule", "SequenceConfig", "TrackingConfig"]

@@ -20,7 +20,7 @@ from jaxtyping import Float64
 from scipy.linalg import cho_factor, cho_solve
 
 from capture4d.body.posed_surface import BodyState, Matches, TrackedBody, match, normal_equations, pose_surface
-from capture4d.captures.scan_points import ScanPoints, subsample
+from capture4d.captures.points.scan_points import ScanPoints, subsample
 from capture4d.tracking.config import FitConfig, Schedule
 from capture4d.tracking.joint_prior import JointPrior, limit_terms, pull_terms
 

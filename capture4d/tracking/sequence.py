@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from capture4d.body.posed_surface import BodyState, TrackedBody, match, pose_surface, tracked_body
 from capture4d.body.skinning import with_pose, with_shape
-from capture4d.captures.scan_points import ScanPoints
+from capture4d.captures.points.scan_points import ScanPoints
 from capture4d.tracking.cold_start import find_pose
 from capture4d.tracking.config import Schedule, SequenceConfig, TrackingConfig
 from capture4d.tracking.fit import Expectation, Fit, fit_body

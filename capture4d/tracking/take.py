@@ -10,7 +10,7 @@ import numpy as np
 
 from capture4d.body.posed_surface import BodyState
 from capture4d.captures.capture import Capture, read_scan, scan_path
-from capture4d.captures.scan_points import KeptPoints, ScanPoints, label_scan, scan_points
+from capture4d.captures.points.scan_points import KeptPoints, ScanPoints, label_scan, scan_points
 from capture4d.captures.scan_states import scan_looked_at
 from capture4d.captures.segments import Segment, cut
 from capture4d.captures.take_colours import KnownColours, described_colours

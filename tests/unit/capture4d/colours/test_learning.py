@@ -12,8 +12,8 @@ import pytest
 
 from capture4d.captures.capture import read_capture, read_scan, scan_path
 from capture4d.captures.garment_scans import load_garment_scan
-from capture4d.captures.sampling import SamplingConfig
-from capture4d.captures.scan_points import ScanPoints, label_scan, scan_points
+from capture4d.captures.points.sampling import SamplingConfig
+from capture4d.captures.points.scan_points import ScanPoints, label_scan, scan_points
 from capture4d.captures.take_colours import take_colours
 from capture4d.colours.learning import ColoursNotSeparableError, fit_light, learn_colours
 from capture4d.colours.spaces import encode_colours, linear_colours

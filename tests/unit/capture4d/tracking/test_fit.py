@@ -12,7 +12,7 @@ from benchmarks.dressed_body import dress_body, sample_scan
 from capture4d.body.anny import load_anny
 from capture4d.body.posed_surface import BodyState, linearise, match, pose_surface, tracked_body
 from capture4d.body.skinning import pose_frame, with_pose, with_shape
-from capture4d.captures.scan_points import ScanPoints
+from capture4d.captures.points.scan_points import ScanPoints
 from capture4d.tracking.config import FitConfig, Schedule, SequenceConfig, TrackingConfig
 from capture4d.tracking.fit import fit_body
 from capture4d.tracking.joint_prior import inverse_left_jacobian, joint_prior, limit_terms, pull_terms

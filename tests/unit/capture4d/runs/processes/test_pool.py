@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from capture4d.errors import InputError
-from capture4d.runs.worker_pool import WorkerPool, cpu_of_workers, kept_workers
+from capture4d.runs.processes.pool import WorkerPool, cpu_of_workers, kept_workers
 from capture4d.runs.workers import run_jobs
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from capture4d.captures.capture import read_capture, read_scan
-from capture4d.captures.sampling import SamplingConfig
-from capture4d.captures.scan_points import KeptPoints, label_scan, scan_points
+from capture4d.captures.points.sampling import SamplingConfig
+from capture4d.captures.points.scan_points import KeptPoints, label_scan, scan_points
 from capture4d.captures.scan_states import scan_looked_at
 from capture4d.captures.take_colours import take_colours
 from capture4d.geometry.mesh import vertex_normals

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
 from capture4d.captures.capture import Capture
-from capture4d.captures.sampling import SamplingConfig
+from capture4d.captures.points.sampling import SamplingConfig
 from capture4d.captures.scan_states import as_it_is_now, scan_digest
 from capture4d.captures.take_colours import KnownColours, described_colours
 from capture4d.colours.labels import classify_colours, settle_labels
