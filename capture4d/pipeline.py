@@ -49,14 +49,9 @@ __all__ = [
 
 @logged_stage("extract")
 def extract(
-    capture: AnyCapture,
-    work: AnyWork,
-    *,
-    learn_colours: bool = False,
-    for_tracking: bool | None = None,
-    workers: int = 1,
-    overwrite: bool = False,
-) -> StageResult:
+    capture: AnyCapture, work: AnyWork, *, learn_colours: bool = False, for_tracking: bool | None = None,
+    workers: int = 1, overwrite: bool = False,
+) -> StageResult:  # fmt: skip
     """Cut the garment out of every scan by its colour, and find its painted borders: WORK/garment.
 
     Args:
@@ -67,15 +62,10 @@ def extract(
     from capture4d.extraction.stage import ExtractionSettings
     from capture4d.extraction.stage import run as stage
 
-    config = ExtractionSettings(learn_colours=learn_colours)
     return stage(
-        opened_capture(capture),
-        path_of(work) / "garment",
-        config,
-        workers=workers,
-        overwrite=overwrite,
-        for_tracking=for_tracking,
-    )
+        opened_capture(capture), path_of(work) / "garment", ExtractionSettings(learn_colours=learn_colours),
+        workers=workers, overwrite=overwrite, for_tracking=for_tracking,
+    )  # fmt: skip
 
 
 @logged_stage("track")
@@ -90,13 +80,8 @@ def track(
     """Track the body through every scan, its poses and one shape for the take: WORK/body."""
     from capture4d.tracking.stage import run as stage
 
-    return stage(
-        opened_capture(capture),
-        path_of(work) / "body",
-        config or TrackingConfig(),
-        workers=workers,
-        overwrite=overwrite,
-    )
+    config = config or TrackingConfig()
+    return stage(opened_capture(capture), path_of(work) / "body", config, workers=workers, overwrite=overwrite)
 
 
 @logged_stage("register")
@@ -118,14 +103,9 @@ def register(
 
     folder = path_of(work)
     return stage(
-        opened_capture(capture),
-        folder / "garment",
-        folder / "registration",
-        config or RegistrationConfig(),
-        body_folder=folder / "body" if tracked else None,
-        workers=workers,
-        overwrite=overwrite,
-    )
+        opened_capture(capture), folder / "garment", folder / "registration", config or RegistrationConfig(),
+        body_folder=folder / "body" if tracked else None, workers=workers, overwrite=overwrite,
+    )  # fmt: skip
 
 
 @logged_stage("report")
