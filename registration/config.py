@@ -20,9 +20,11 @@ from typing import Annotated, Literal
 from capture4d.settings import Cosine, Count, NonNegative, Percent, Positive, Range, Share, Whole, settings
 
 __all__ = [
+    "PAIR",
     "PAPER",
     "PRESETS",
     "SOFT",
+    "STIFF",
     "ApproachConfig",
     "BoundaryConfig",
     "CoarseConfig",
@@ -81,6 +83,9 @@ class DataConfig:
     to cloth in an armpit is the scan of the sleeve that hides it (rule plane); 0 rejects none."""
     robust_scale: Positive = 0.4
     """Scale of the Geman-McClure weight, as a share of the distance gate."""
+    normals: Literal["scan", "both"] = "scan"
+    """Whose normal the plane has, under rule plane: the scan's, or the mean of both (Rusinkiewicz
+    2019), by which a template slides and turns into its place in fewer steps."""
     point_share: Share = 0.0
     """Weight of the tangential part of the match: 0 is point-to-plane, 1 is point-to-point."""
     smoothing_passes: Whole = 1
@@ -287,13 +292,33 @@ SOFT = RegistrationConfig(
 )
 
 
+PAIR = RegistrationConfig(
+    data=DataConfig(normals="both"),
+    dense=DenseConfig(
+        cold=Schedule(8, (0.03, 0.012), smooth=(2.0, 0.2), stretch=(10.0, 0.03), boundary=(0.3, 0.05)),
+        plasticity=0.0,
+    ),
+)
+"""Two meshes of one thing: the folds of one are no folds of the other, so that the shape is held more firmly than in a
+take. The softer schedule of takes ends 3 mm farther off (people, 140 mm)."""
+
+STIFF = RegistrationConfig(
+    data=DataConfig(normals="both"),
+    dense=DenseConfig(
+        cold=Schedule(12, (0.03, 0.012), smooth=(300.0, 3.0), stretch=(10.0, 0.03), boundary=(0.3, 0.05)),
+        plasticity=0.0,
+    ),
+)
+"""After the way from afar: limbs turn and slide into their places with the shape that they have."""
+
+
 @settings
 class ApproachConfig:
     """From a start that is far off: every scan point votes among all template vertices."""
 
-    steps: Count = 40
+    steps: Count = 20
     """Gauss-Newton steps; the votes are counted anew before each."""
-    width: tuple[Positive, Positive] = (0.06, 0.008)
+    width: tuple[Positive, Positive] = (0.06, 0.012)
     """Standard deviation of the Gaussian by which a scan point divides its vote, metres, first and last step."""
     wider: Positive = 0.1
     """The same in the first step of a second attempt, where the first has failed."""
@@ -330,6 +355,9 @@ class ScanFitConfig:
     beyond_check_percent: Percent = 3.0
     """Share of the scan beyond the template's open borders above which the result is to be checked: the scan shows more
     than the template, or the template has not slid there."""
+    swung_check_mm: NonNegative = 45.0
+    """Mean way of the template's vertices from the start, beyond the best rigid motion, above which the result is to be
+    checked: how limbs have turned and slid under their clothes is known less well the farther they have swung."""
     flipped_fail_percent: Percent = 5.0
     """Share of faces against the scan's normals above which it has failed."""
     cut_fail_percent: Percent = 30.0
@@ -352,8 +380,10 @@ class MeshRegistrationConfig:
     """kept: the scan shows the template's own thing, moved, and distances along the surface stay. free: it shows
     another of its kind, as another face, and the template grows and shrinks. auto: kept, and free where the scan is not
     reached so."""
-    registration: RegistrationConfig = RegistrationConfig()
+    registration: RegistrationConfig = PAIR
     """Settings where lengths are kept, for a template whose diagonal is 1.2 m."""
+    stiff: RegistrationConfig = STIFF
+    """Settings between the way there from afar and the dense stage of these."""
     soft: RegistrationConfig = SOFT
     """Settings where lengths are free."""
     approach: ApproachConfig = ApproachConfig()

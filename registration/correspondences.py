@@ -108,11 +108,17 @@ def match(
     points: Float64[np.ndarray, "queries 3"],
     normals: Float64[np.ndarray, "queries 3"],
     gates: Gates,
+    *,
+    of_both: bool = False,
 ) -> Matches:
     """Nearest scan vertex of each point, gated in distance and normal, with Geman-McClure weights.
 
     A point whose nearest scan vertex looks another way, as on two layers of cloth, takes the nearest that does not, if
     there is one close beside it. Weights are by the distance along the scan's normal.
+
+    Args:
+        of_both: planes have the mean of the scan's normal and the point's own.
+    References: Rusinkiewicz 2019 (a symmetric objective function for ICP), for the mean.
     """
     distances, indices = surface.grid.query(points, gates.distance)
     found = indices < len(surface.points)
@@ -129,7 +135,12 @@ def match(
     cosine[changed] = np.einsum("va,va->v", normals[changed], surface.normals[nearest[changed]])
     target, target_normal = surface.points[nearest], surface.normals[nearest]
     off_plane = np.einsum("va,va->v", points - target, target_normal)
-    return Matches(target, target_normal, gates.weigh(off_plane, ~found | (cosine < gates.normal_cosine)))
+    weights = gates.weigh(off_plane, ~found | (cosine < gates.normal_cosine))
+    if of_both:
+        mean = target_normal + normals
+        length = np.linalg.norm(mean, axis=1, keepdims=True)
+        target_normal = np.where(length > 1e-6, mean / np.maximum(length, 1e-6), target_normal)
+    return Matches(target, target_normal, weights)
 
 
 def of_another_part(

@@ -3,8 +3,8 @@
 In this order, until the scan is reached:
 
     near       as a garment of the frame before: coarse, then vertex by vertex, with lengths kept
-    far        drawn there as a whole first (`approach`), then vertex by vertex; from where a rigid motion puts the
-               template, if that is far nearer and `align` may
+    far        drawn there as a whole first (`approach`), then vertex by vertex, stiffly and less so; from where a
+               rigid motion puts the template, if that is far nearer and `align` may
     wide       the same with wider votes, where limbs had to swing
     soft       growing and shrinking, for what is another of its kind
 
@@ -163,7 +163,8 @@ def _keeping_lengths(tried: _Attempts, start: np.ndarray, landmarks: Landmarks |
 
     def far(width: float) -> np.ndarray:
         there = approach(analysis, scan.surface, start, config.approach, first_width=width, landmarks=landmarks)
-        return register_frame(analysis, scan, there, config=_dense_alone(own)).vertices
+        settled = register_frame(analysis, scan, there, config=_dense_alone(config.stiff)).vertices
+        return register_frame(analysis, scan, settled, config=_dense_alone(own)).vertices
 
     def both() -> bool:
         return (landmarks is None and tried.add("near", start, near)) or tried.add("far", start, first)
@@ -260,11 +261,14 @@ def judge(
     vertices: Float64[np.ndarray, "verts 3"],
     config: ScanFitConfig,
     *,
+    start: Float64[np.ndarray, "verts 3"],
     length_factor: float = 1.0,
 ) -> tuple[str, tuple[str, ...]]:
-    """Verdict and reasons, with what a take's frames are not judged by: what of the scan the template leaves unreached.
+    """Verdict and reasons, with what a take's frames are not judged by: what of the scan the template leaves unreached,
+    and how far it has swung.
 
     Args:
+        start: where the template lay, metres.
         length_factor: the reasons give lengths times this.
     """
     every, nearest = scan_distances(analysis, scan, vertices)
@@ -273,6 +277,8 @@ def judge(
     mean, far = 1e3 * float(away.mean()), 1e3 * float(np.percentile(away, 95))
     facets = 1e3 * FACETS * float(analysis.rest_lengths.mean())
     past = 100.0 * float((beyond & (1e3 * every > config.far_fail_mm)).mean())
+    rigid = fit_similarity(start, vertices, with_scale=False).apply(start)
+    swung = 1e3 * float(np.linalg.norm(vertices - rigid, axis=1).mean())
     share = 100.0 / max(len(analysis.faces), 1)
     flipped, cut = quality.numbers["flipped_faces"] * share, quality.numbers["self_intersections"] * share
     failed, check = [], []
@@ -280,6 +286,7 @@ def judge(
         ("mean distance from scan to template", mean, config.check_mm + facets, config.fail_mm + facets, " mm"),
         ("95 % of the scan within", far, config.far_check_mm + facets, config.far_fail_mm + facets, " mm"),
         ("share of the scan beyond the template's borders", past, config.beyond_check_percent, np.inf, " %"),
+        ("mean way beyond a rigid motion", swung, config.swung_check_mm, np.inf, " mm"),
         ("flipped faces", flipped, np.inf, config.flipped_fail_percent, " %"),
         ("self-intersecting faces", cut, np.inf, config.cut_fail_percent, " %"),
     ):

@@ -266,7 +266,7 @@ def _data_term(
         voters, length = data.max_voters, data.normal_length
         found = match_both_ways(surface, points, normals, gates, neighbours=3, max_points=voters, normal_length=length)
     else:
-        found = match(surface, points, normals, gates)
+        found = match(surface, points, normals, gates, of_both=data.normals == "both")
         if data.other_part_share > 0.0:
             away = np.where(found.weights > 0.0, np.linalg.norm(points - found.points, axis=1), 0.0)
             reach = PART_EDGES * float(analysis.rest_lengths.mean())

@@ -192,7 +192,13 @@ def register_mesh(
     factor, limits = metres / scale, config.registration.quality
     quality = assess(fitted.analysis, fitted.scan, fitted.vertices, limits, length_factor=factor)
     verdict, reasons = judge(
-        quality, fitted.analysis, fitted.scan, fitted.vertices, config.scan_fit, length_factor=factor
+        quality,
+        fitted.analysis,
+        fitted.scan,
+        fitted.vertices,
+        config.scan_fit,
+        start=fitted.start,
+        length_factor=factor,
     )
     return MeshRegistration(
         vertices=(fitted.vertices / scale + origin).astype(np.float32)[split.of_vertex],

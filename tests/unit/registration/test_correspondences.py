@@ -89,6 +89,26 @@ def test_the_layer_that_looks_the_right_way_is_matched(tube: Callable[[int, int]
     assert (np.einsum("va,va->v", found.normals, outward) > 0).all()
 
 
+def test_on_a_round_surface_the_mean_normal_leaves_nothing_to_pull_at(tube: Callable[[int, int], Mesh]) -> None:
+    """Two points of one circle lie in a plane that the mean of their normals is upright on; of the scan's own plane
+    the other point is off, which holds a turning limb back."""
+    mesh = tube(24, 12)
+    vertices = mesh.vertices.astype(float)
+    ring = 2 * np.pi * np.arange(len(vertices)) / 24
+    vertices[:, 0], vertices[:, 2] = 0.2 * np.sin(ring), 0.2 * np.cos(ring)
+    surface = prepare_scan(vertices, mesh.faces, smoothing_passes=0)
+    angle = 0.4 * 2 * np.pi / 24  # short of half way to the next scan point
+    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    points, normals = vertices @ turn.T, surface.normals @ turn.T
+    gates = Gates(0.05, normal_cosine=0.4, robust_scale=1.0)
+    off = {}
+    for of_both in (False, True):
+        found = match(surface, points, normals, gates, of_both=of_both)
+        np.testing.assert_allclose(np.linalg.norm(found.normals, axis=1), 1.0, atol=1e-9)
+        off[of_both] = np.abs(np.einsum("va,va->v", points - found.points, found.normals)).max()
+    assert off[True] < 0.02 * off[False]
+
+
 def test_scan_beyond_the_edge_pulls_only_if_it_has_a_vote(tube: Callable[[int, int], Mesh]) -> None:
     template, scan = tube(24, 12), tube(80, 40)
     low = template.vertices.astype(float) * [1, 0.8, 1]

@@ -5,7 +5,7 @@ import pytest
 
 from capture4d.colours.labels import classify_colours
 from capture4d.errors import InputError
-from capture4d.extraction.garment import ColourNotFoundError, extract_garment
+from capture4d.extraction.garment import ColourNotFoundError, extract_garment, painted_border
 from capture4d.types import Mesh, Scan
 from tests.shapes import tube_faces
 
@@ -54,6 +54,30 @@ def test_border_points_lie_on_the_border(holes: int) -> None:
     assert np.abs(height[top] - 0.3).mean() < 0.002  # the scan ends here, at the bottom it goes on; samples: 3.4 mm
     assert np.abs(height[bottom]).mean() < 0.0025
     assert np.percentile(np.abs(height[bottom]), 95) < 0.006
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_a_ragged_scan_lost_of_the_paint_is_given_back(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    spacing = 0.003
+    height, along = np.arange(50) * spacing, np.arange(120) * spacing
+    grid = np.stack(np.meshgrid(along, height, indexing="ij"), axis=2).reshape(-1, 2)
+    grid += rng.uniform(-0.2, 0.2, grid.shape) * spacing
+    border = grid[:, 1].max()
+    corner = (np.arange(119)[:, None] * 50 + np.arange(49)).reshape(-1)
+    faces = np.concatenate([corner[:, None] + [0, 50, 51], corner[:, None] + [0, 51, 1]]).astype(np.int32)
+    lost = np.repeat(rng.uniform(0.2, 1.6, 120), 50) * spacing
+    faces = faces[(grid[:, 1] < border - lost)[faces].all(axis=1)]
+    used, renumbered = np.unique(faces, return_inverse=True)
+    vertices = np.column_stack([grid, np.zeros(len(grid))])[used]
+    colours = np.where(vertices[:, 1:2] > border - 0.015, TOP, CLOTH).astype(np.uint8)
+    mesh = Mesh(vertices.astype(np.float32), renumbered.reshape(-1, 3).astype(np.int32))
+    found = painted_border(mesh, colours, TOP)
+    inside = found[(found[:, 0] > 0.03) & (found[:, 0] < along[-1] - 0.03)]
+    ends = [vertices[np.abs(vertices[:, 0] - x) < spacing / 2, 1].max() for x in along]
+    assert border - np.mean(ends) > spacing
+    assert len(inside) > 60
+    assert abs(inside[:, 1].mean() - border) < 0.5 * spacing
 
 
 def test_one_paint_cannot_tell_loops_apart() -> None:
