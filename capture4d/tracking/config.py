@@ -50,7 +50,7 @@ class FitConfig:
     shape_spread: Positive = 1.0
     """Standard deviation of the shape coefficients before any scan."""
     few_points: Count = 1500
-    """Points of a scan that the first steps of a fit look at: the last two, to which they only lead, look at all."""
+    """Points of a scan that the first steps of a fit look at: the last three, to which they only lead, look at all."""
 
 
 @settings
@@ -94,7 +94,7 @@ class SequenceConfig:
     """Of a frame that starts from the one before."""
     retry: Schedule = Schedule(iterations=15, first_scale_m=0.12, last_scale_m=0.015)
     """Of a frame that this did not fit."""
-    refine: Schedule = Schedule(iterations=2, first_scale_m=0.02, last_scale_m=0.015)
+    refine: Schedule = Schedule(iterations=3, first_scale_m=0.02, last_scale_m=0.015)
     """Of the second pass, with the one shape of the take."""
     momentum: Share = 0.9
     """Share of the last motion that is expected to go on."""

@@ -26,9 +26,8 @@ from capture4d.tracking.joint_prior import JointPrior, limit_terms, pull_terms
 
 __all__ = ["Expectation", "Fit", "fit_body"]
 
-WHOLE_STEPS = 2
-"""Last steps of a fit that look at all points. With one, joints were 2 % farther off, and those farthest off 15 %
-(`python -m benchmarks tracking`)."""
+WHOLE_STEPS = 3
+"""Last steps of a fit that look at all points. With one or two, joints were 2 to 3 % farther off (docs/notebook)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
