@@ -90,6 +90,8 @@ class DataConfig:
     """Weight of the tangential part of the match: 0 is point-to-plane, 1 is point-to-point."""
     smoothing_passes: Whole = 1
     """Laplacian passes over the scan before its normals are taken."""
+    unshrunk: bool = False
+    """Follow each by a pass outwards: a scan as coarse as 8 mm loses half a millimetre of its limbs otherwise."""
 
 
 @settings
@@ -293,7 +295,7 @@ SOFT = RegistrationConfig(
 
 
 PAIR = RegistrationConfig(
-    data=DataConfig(normals="both"),
+    data=DataConfig(normals="both", smoothing_passes=4, unshrunk=True),
     dense=DenseConfig(
         cold=Schedule(8, (0.03, 0.012), smooth=(2.0, 0.2), stretch=(10.0, 0.03), boundary=(0.3, 0.05)),
         plasticity=0.0,
@@ -303,7 +305,7 @@ PAIR = RegistrationConfig(
 take. The softer schedule of takes ends 3 mm farther off (people, 140 mm)."""
 
 STIFF = RegistrationConfig(
-    data=DataConfig(normals="both"),
+    data=DataConfig(normals="both", smoothing_passes=4, unshrunk=True),
     dense=DenseConfig(
         cold=Schedule(12, (0.03, 0.012), smooth=(300.0, 3.0), stretch=(10.0, 0.03), boundary=(0.3, 0.05)),
         plasticity=0.0,
@@ -355,6 +357,9 @@ class ScanFitConfig:
     beyond_check_percent: Percent = 3.0
     """Share of the scan beyond the template's open borders above which the result is to be checked: the scan shows more
     than the template, or the template has not slid there."""
+    lost_fail_percent: Percent = 5.0
+    """Share of the template farther than `far_fail_mm` from the scan above which it has failed, where the scan is
+    doubtfully reached as well: a limb went elsewhere. Where all of the scan is reached, it only shows less."""
     swung_check_mm: NonNegative = 45.0
     """Mean way of the template's vertices from the start, beyond the best rigid motion, above which the result is to be
     checked: how limbs have turned and slid under their clothes is known less well the farther they have swung."""

@@ -279,6 +279,8 @@ def judge(
     past = 100.0 * float((beyond & (1e3 * every > config.far_fail_mm)).mean())
     rigid = fit_similarity(start, vertices, with_scale=False).apply(start)
     swung = 1e3 * float(np.linalg.norm(vertices - rigid, axis=1).mean())
+    lost = 100.0 * float((1e3 * scan.surface.grid.query(vertices)[0] > config.far_fail_mm).mean())
+    unreached = mean > config.check_mm + facets or far > config.far_check_mm + facets
     share = 100.0 / max(len(analysis.faces), 1)
     flipped, cut = quality.numbers["flipped_faces"] * share, quality.numbers["self_intersections"] * share
     failed, check = [], []
@@ -286,6 +288,13 @@ def judge(
         ("mean distance from scan to template", mean, config.check_mm + facets, config.fail_mm + facets, " mm"),
         ("95 % of the scan within", far, config.far_check_mm + facets, config.far_fail_mm + facets, " mm"),
         ("share of the scan beyond the template's borders", past, config.beyond_check_percent, np.inf, " %"),
+        (
+            "share of the template far from the scan",
+            lost,
+            np.inf,
+            config.lost_fail_percent if unreached else np.inf,
+            " %",
+        ),
         ("mean way beyond a rigid motion", swung, config.swung_check_mm, np.inf, " mm"),
         ("flipped faces", flipped, np.inf, config.flipped_fail_percent, " %"),
         ("self-intersecting faces", cut, np.inf, config.cut_fail_percent, " %"),

@@ -78,7 +78,10 @@ def prepare_frame(analysis: TemplateAnalysis, scan: GarmentScan, config: Registr
     """
     if not len(scan.mesh.faces):
         raise InputError(f"frame {scan.frame_id}: expected a garment scan with faces, found none")
-    surface = prepare_scan(scan.mesh.vertices, scan.mesh.faces, smoothing_passes=config.data.smoothing_passes)
+    data = config.data
+    surface = prepare_scan(
+        scan.mesh.vertices, scan.mesh.faces, smoothing_passes=data.smoothing_passes, unshrunk=data.unshrunk
+    )
     colours = None if scan.colours is None or not analysis.cloth else log_colours(surface.of_points(scan.colours))
     told = np.unique(scan.boundary_loops[scan.boundary_loops >= 0])
     require_borders(analysis.border, [scan.loop_names[loop] for loop in told])

@@ -1,10 +1,15 @@
 """Verdicts on two meshes: what swung is doubted, what was only carried elsewhere is not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from capture4d.geometry.mesh import submesh
+from capture4d.types import GarmentScan, Mesh
 from registration.config import ScanFitConfig
+from registration.correspondences import mesh_normals
 from registration.mesh_fit import judge
 from registration.quality import assess
 from registration.register import prepare_frame
@@ -32,3 +37,22 @@ def test_what_has_swung_is_to_be_checked(move, doubted: bool, garment, scan_of, 
     verdict, reasons = judge(quality, analysis, scan, vertices, limits, start=analysis.rest)
     assert any("beyond a rigid motion" in reason for reason in reasons) == doubted
     assert verdict != "failed"
+
+
+@pytest.mark.parametrize(("off", "lost"), [(0.004, True), (0.0, False)])
+def test_a_part_that_went_elsewhere_has_failed_and_what_is_not_scanned_has_not(
+    off: float, lost: bool, garment, scan_of, config
+) -> None:
+    """The scan shows the lower part; the upper one lies elsewhere, and the rest upon the scan, or 4 mm beside it."""
+    analysis = analyse_template(garment, config)
+    whole = scan_of(lambda points: points)
+    lower = whole.mesh.faces[(whole.mesh.vertices[whole.mesh.faces, 1] < 0.3).all(axis=1)]
+    mesh, _ = submesh(Mesh(whole.mesh.vertices, lower), np.ones(len(lower), bool))
+    none = np.zeros((0, 3), np.float32)
+    scan = prepare_frame(analysis, GarmentScan(mesh, none, np.zeros(0, np.int32), (), 0), config)
+    vertices = analysis.rest + off * mesh_normals(analysis.rest, analysis.faces)
+    vertices[analysis.rest[:, 1] > 0.32, 0] += 0.3
+    quality = replace(assess(analysis, scan, vertices, config.quality), verdict="good", reasons=())
+    verdict, reasons = judge(quality, analysis, scan, vertices, ScanFitConfig(), start=analysis.rest)
+    assert (verdict == "failed") == lost
+    assert any("far from the scan" in reason for reason in reasons) == lost
