@@ -223,8 +223,10 @@ class QualityConfig:
     """Share of faces that cut another face above which a frame is to be checked: 20 of a template with 5,000 vertices.
     Where cloth cuts itself it is guessed, as in the armpits of hanging arms."""
     unfitted_mm: NonNegative = 5.0
-    """Distance to the scan above which a single vertex that it shows makes a frame one to be checked; what lies farther
-    behind cloth that is on the scan is hidden. 0: no single vertex does."""
+    """A vertex farther from a scan that shows it is not fitted; what lies farther behind cloth that is on the scan is
+    hidden. 0: neither is looked for."""
+    unfitted_check_percent: Percent = 0.2
+    """Share of such vertices above which a frame is to be checked: 10 of a template with 5,000."""
     region_far_percent: Percent = 5.0
     """Share of a region's vertices, of those with scan data, more than 2 mm from it, above which a frame is to be
     checked."""

@@ -213,9 +213,10 @@ def _seen(
     foreign = of_another_part(points, doubtful, every, vertices, analysis.rest, share=PART_SHARE, reach=reach)
     hidden = foreign | (away & (facing < 0.0))
     covered = (sideways <= COVERED_SPACINGS * surface.spacing) & ~hidden
-    behind = np.flatnonzero(covered & (above < -unfitted)) if unfitted > 0.0 else np.zeros(0, np.int64)
-    if len(behind):
-        covered[behind] = _face_distances(analysis, vertices, points[behind])[0] > unfitted
+    within = covered & (height > unfitted) & ((above < 0.0) | (facing < 0.0))
+    doubted = np.flatnonzero(within) if unfitted > 0.0 else np.zeros(0, np.int64)
+    if len(doubted):
+        covered[doubted] = _face_distances(analysis, vertices, points[doubted])[0] > unfitted
     return facing, height, covered
 
 
@@ -298,7 +299,7 @@ def _judge(
             failed.append(f"{name} {_short(value * factor)} > {wrong * factor:.4g}{unit}")
         elif value > doubtful:
             check.append(f"{name} {_short(value * factor)} > {doubtful * factor:.4g}{unit}")
-    if numbers["unfitted_vertices"]:
+    if numbers["unfitted_vertices"] * share > config.unfitted_check_percent / 2.0:  # two faces to a vertex
         limit = config.unfitted_mm * length_factor
         check.append(f"{numbers['unfitted_vertices']} vertices with scan data more than {limit:.4g} mm from it")
     check += _doubts_of_regions(regions, config, length_factor)
