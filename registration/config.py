@@ -220,7 +220,7 @@ class QualityConfig:
     """99th percentile of edge stretch above which a frame has failed."""
     flipped_check_percent: Percent = 1.0
     """Share of faces against the scan's normals above which a frame is to be checked."""
-    intersections_check_percent: Percent = 0.2
+    intersections_check_percent: Percent = 0.21
     """Share of faces that cut another face above which a frame is to be checked: 20 of a template with 5,000 vertices.
     Where cloth cuts itself it is guessed, as in the armpits of hanging arms."""
     unfitted_mm: NonNegative = 5.0
