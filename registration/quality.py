@@ -115,7 +115,7 @@ def assess(
         regions: vertices of each, as `registration.regions.find_regions` finds them.
         length_factor: lengths are reported times this; the limits hold for them as they are.
     """
-    facing, height, covered = _seen(analysis, scan.surface, vertices)
+    facing, height, covered = _seen(analysis, scan.surface, vertices, config.unfitted_mm / 1e3)
     residual = np.where(covered, height, np.nan)
     stretch = edge_stretch(vertices, analysis.edges, edge_lengths(analysis.rest, analysis.edges))
     against = (facing < 0.0) & covered
@@ -132,6 +132,7 @@ def assess(
         "fit_p99_mm": _percentile(fit, 99),
         "fit_max_mm": float(fit.max()) if len(fit) else float("nan"),
         "fit_beyond_percent": _mean(100.0 * (fit > FAR_MM)),
+        "unfitted_vertices": int((fit > config.unfitted_mm).sum()) if config.unfitted_mm > 0.0 else 0,
         "scan_fit_mean_mm": _mean(scan_fit),
         "scan_fit_p95_mm": _percentile(scan_fit, 95),
         "boundary_mean_mm": _mean(1e3 * border),
@@ -191,17 +192,19 @@ def _border_errors(
 
 
 def _seen(
-    analysis: TemplateAnalysis, surface: ScanSurface, vertices: np.ndarray
+    analysis: TemplateAnalysis, surface: ScanSurface, vertices: np.ndarray, unfitted: float
 ) -> tuple[Float64[np.ndarray, " verts"], Float64[np.ndarray, " verts"], Bool[np.ndarray, " verts"]]:
     """Of each vertex the cosine to the nearest scan point's normal, the distance to its plane, and whether the scan
     shows the vertex at all.
 
     Cloth in an armpit lies 2 to 5 cm behind the sleeve that hides it. That distance is no error, and the true cloth has
-    it, too: what is nearest there is the scan of another part, or faces the other way.
+    it, too: what is nearest there is the scan of another part, or faces the other way. And cloth that is crumpled
+    behind itself, farther than `unfitted` (metres; 0: no such cloth), finds only scan that other faces fit.
     """
     distance, nearest = surface.grid.query(vertices)
     points, normals = surface.points[nearest], surface.normals[nearest]
-    height = np.abs(np.einsum("va,va->v", vertices - points, normals))
+    above = np.einsum("va,va->v", vertices - points, normals)
+    height = np.abs(above)
     sideways = np.sqrt(np.maximum(distance**2 - height**2, 0.0))
     facing = np.einsum("va,va->v", mesh_normals(vertices, analysis.faces), normals)
     away = distance > LOOKED_AT_SPACINGS * surface.spacing
@@ -209,7 +212,12 @@ def _seen(
     every, doubtful = np.arange(len(vertices)), np.where(away, distance, 0.0)
     foreign = of_another_part(points, doubtful, every, vertices, analysis.rest, share=PART_SHARE, reach=reach)
     hidden = foreign | (away & (facing < 0.0))
-    return facing, height, (sideways <= COVERED_SPACINGS * surface.spacing) & ~hidden
+    covered = (sideways <= COVERED_SPACINGS * surface.spacing) & ~hidden
+    within = covered & (height > unfitted) & ((above < 0.0) | (facing < 0.0))
+    doubted = np.flatnonzero(within) if unfitted > 0.0 else np.zeros(0, np.int64)
+    if len(doubted):
+        covered[doubted] = _face_distances(analysis, vertices, points[doubted])[0] > unfitted
+    return facing, height, covered
 
 
 def _creased(analysis: TemplateAnalysis, vertices: np.ndarray) -> Bool[np.ndarray, " edges"]:
@@ -253,7 +261,13 @@ def scan_distances(
 ) -> tuple[Float64[np.ndarray, " points"], Int64[np.ndarray, " points"]]:
     """Of some 4,000 scan points, the distance to the faces around each one's nearest template vertex, metres; and that
     vertex."""
-    points = scan.surface.points[:: max(1, len(scan.surface.points) // 4000)]
+    return _face_distances(analysis, vertices, scan.surface.points[:: max(1, len(scan.surface.points) // 4000)])
+
+
+def _face_distances(
+    analysis: TemplateAnalysis, vertices: np.ndarray, points: np.ndarray
+) -> tuple[Float64[np.ndarray, " points"], Int64[np.ndarray, " points"]]:
+    """Of each point, the distance to the faces around its nearest template vertex, metres; and that vertex."""
     used = np.unique(analysis.faces)
     cell = 2.0 * float(analysis.rest_lengths.mean())
     nearest = used[PointGrid.build(vertices[used], cell).query(points)[1]]
@@ -285,6 +299,9 @@ def _judge(
             failed.append(f"{name} {_short(value * factor)} > {wrong * factor:.4g}{unit}")
         elif value > doubtful:
             check.append(f"{name} {_short(value * factor)} > {doubtful * factor:.4g}{unit}")
+    if numbers["unfitted_vertices"] * share > config.unfitted_check_percent / 2.0:  # two faces to a vertex
+        limit = config.unfitted_mm * length_factor
+        check.append(f"{numbers['unfitted_vertices']} vertices with scan data more than {limit:.4g} mm from it")
     check += _doubts_of_regions(regions, config, length_factor)
     if covered < config.min_covered_percent:
         failed.append(f"scan data for {covered:.0f} % < {config.min_covered_percent:g} % of vertices")

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from capture4d.geometry.mesh import normalised
 from registration.config import QualityConfig
 from registration.quality import REGION_MEASURES, FrameQuality, assess, border_distances
 from registration.register import prepare_frame
@@ -162,6 +163,53 @@ def test_a_spike_in_its_own_cloth_is_an_error(garment, scan_of, config) -> None:
     outwards = moved[vertex] * [1, 0, 1]
     moved[vertex] += 0.012 * outwards / np.linalg.norm(outwards)
     assert 0.008 < assess(analysis, frame, moved, QualityConfig()).residual_m[vertex] < 0.0125
+
+
+def test_vertices_far_from_their_scan_are_counted_and_to_be_checked(garment, scan_of, config) -> None:
+    """One in 648 is told, two are too many."""
+    analysis = analyse_template(garment, config)
+    frame = prepare_frame(analysis, scan_of(straight_through), config)
+    moved, told = analysis.rest.copy(), []
+    for vertex in (36 * 6, 36 * 12):
+        told.append(assess(analysis, frame, moved, QualityConfig()))
+        moved[vertex] += 0.012 * normalised(moved[vertex : vertex + 1] * [1, 0, 1])[0]
+    told.append(assess(analysis, frame, moved, QualityConfig()))
+    assert [each.numbers["unfitted_vertices"] for each in told] == [0, 1, 2]
+    assert [each.verdict for each in told] == ["good", "good", "check"]
+    assert told[2].reasons == ("2 vertices with scan data more than 5 mm from it",)
+    assert assess(analysis, frame, moved, QualityConfig(unfitted_mm=0)).numbers["unfitted_vertices"] == 0
+
+
+def test_a_few_faces_that_cut_others_are_to_be_checked(garment, scan_of, config) -> None:
+    """Some vertices have changed places with those above them: more faces than one in 500, fewer than one in ten."""
+    analysis = analyse_template(garment, config)
+    frame = prepare_frame(analysis, scan_of(straight_through), config)
+    crossed, below, above = analysis.rest.copy(), 36 * 8 + np.arange(3), 36 * 9 + np.arange(3)
+    crossed[below], crossed[above] = analysis.rest[above], analysis.rest[below]
+    crossed[[*below, *above]] += 0.003 * normalised(crossed[[*below, *above]] * [1, 0, 1])
+    strict, lenient = (
+        assess(analysis, frame, crossed, QualityConfig(intersections_check_percent=limit)) for limit in (0.2, 10.0)
+    )
+    assert 0.2 < 100 * strict.numbers["self_intersections"] / len(analysis.faces) < 10
+    assert any("self-intersecting" in reason for reason in strict.reasons)
+    assert not any("self-intersecting" in reason for reason in lenient.reasons)
+
+
+def test_cloth_tucked_behind_itself_is_unseen(garment, scan_of, config) -> None:
+    """A ring of the tube lies 15 mm inside, and its neighbours close the wall before it."""
+    analysis = analyse_template(garment, config)
+    frame = prepare_frame(analysis, scan_of(straight_through), config)
+    tucked, row = analysis.rest.copy(), np.arange(len(analysis.rest)) // 36
+    height = tucked[36 * 9, 1]
+    tucked[row == 8, 1], tucked[row == 10, 1] = height - 0.001, height + 0.001
+    inside = row == 9
+    level = tucked[inside] * [1, 0, 1]
+    tucked[inside] -= 0.015 * level / np.linalg.norm(level, axis=1, keepdims=True)
+    tucked[inside, 1] += 0.0004  # it looks neither up nor down, but outwards
+    every, own = (assess(analysis, frame, tucked, QualityConfig(unfitted_mm=limit)) for limit in (0.0, 5.0))
+    assert np.isfinite(every.residual_m[inside]).any()
+    assert np.isnan(own.residual_m[inside]).all()
+    assert own.numbers["unfitted_vertices"] == 0
 
 
 def test_regions_are_measured_and_judged(garment, scan_of, config) -> None:
