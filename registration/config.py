@@ -123,8 +123,8 @@ class ColourConfig:
     """Where the colours are as steep as usual, beside 1 of the distance to the scan's planes."""
     robust: Positive = 0.3
     """Scale of the Geman-McClure weight, as a share of the colours' variance."""
-    steps: Whole = 2
-    """Gauss-Newton steps that follow those of the dense stage, with its last weights."""
+    steps: Whole = 0
+    """Gauss-Newton steps beyond those of the dense stage, over all of which its weights move."""
     sharp_steps: Count = 2
     """Last steps, on colours that are blurred narrowly; those before them are on widely blurred ones."""
     stretch: NonNegative = 0.6

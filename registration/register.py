@@ -211,7 +211,7 @@ def _dense_stage(
     if steps and scan.colours is not None:
         pull, steps = ColourPull(analysis, scan.surface, scan.colours, config.colour), steps + config.colour.steps
     for step in range(steps):
-        at = (min(step, schedule.steps - 1), schedule.steps)
+        at = (step, steps)
         gate = anneal(schedule.gate, *at)
         terms: list[Term] = [_data_term(analysis, analysis.vertex_rows, scan.surface, vertices, every, gate, config)]
         terms += _border_terms(

@@ -60,7 +60,8 @@ def weld(vertices: Float[np.ndarray, "V 3"], faces: Integer[np.ndarray, "F 3"]) 
             joined = label[faces]
             sides = _open_sides(joined, open_vertices(np.ascontiguousarray(joined, np.int32), len(vertices))[0])
     if not (label != np.arange(len(label))).any():
-        return Welded(faces.astype(np.int32, copy=False), *(np.arange(len(label), dtype=np.int32),) * 2, against)
+        every = np.arange(len(label), dtype=np.int32)
+        return Welded(faces.astype(np.int32, copy=False), every, every, against)
     standing, first, of_vertex = np.unique(label, return_index=True, return_inverse=True)
     order = np.argsort(first)
     turn = np.empty(len(standing), np.int32)
