@@ -365,9 +365,12 @@ class ScanFitConfig:
     beyond_check_percent: Percent = 3.0
     """Share of the scan beyond the template's open borders above which the result is to be checked: the scan shows more
     than the template, or the template has not slid there."""
+    lost_check_percent: Percent = 5.0
+    """Share of the template farther than `far_fail_mm` from the scan above which the result is to be checked: what is
+    not scanned follows its neighbours, and swings as they do."""
     lost_fail_percent: Percent = 5.0
-    """Share of the template farther than `far_fail_mm` from the scan above which it has failed, where the scan is
-    doubtfully reached as well: a limb went elsewhere. Where all of the scan is reached, it only shows less."""
+    """The same above which it has failed, where the scan is doubtfully reached as well: a limb went elsewhere. Where
+    all of the scan is reached, it only shows less."""
     swung_check_mm: NonNegative = 45.0
     """Mean way of the template's vertices from the start, beyond the best rigid motion, above which the result is to be
     checked: how limbs have turned and slid under their clothes is known less well the farther they have swung."""

@@ -3,8 +3,11 @@
 In this order, until the scan is reached:
 
     near       as a garment of the frame before: coarse, then vertex by vertex, with lengths kept
-    far        drawn there as a whole first (`approach`), then vertex by vertex, stiffly and less so; from where a
-               rigid motion puts the template, if that is far nearer and `align` may
+    far        drawn there as a whole first (`approach`), then vertex by vertex, stiffly and less so
+
+Where `align` may, and a rigid motion brings the template far nearer, both are tried from there as well; from there
+alone if nothing of the scan lies near the start. Then:
+
     wide       the same with wider votes, where limbs had to swing
     soft       growing and shrinking, for what is another of its kind
 
@@ -158,34 +161,37 @@ def _keeping_lengths(tried: _Attempts, start: np.ndarray, landmarks: Landmarks |
     config, analysis, scan = tried.config, tried.kept, tried.scan
     own = config.registration
 
-    def near() -> np.ndarray:
-        return register_frame(analysis, scan, start, config=own).vertices
+    def near(begin: np.ndarray) -> bool:
+        return tried.add("near", begin, lambda: register_frame(analysis, scan, begin, config=own).vertices)
 
-    def far(width: float) -> np.ndarray:
-        there = approach(analysis, scan.surface, start, config.approach, first_width=width, landmarks=landmarks)
+    def drawn(begin: np.ndarray, width: float) -> np.ndarray:
+        there = approach(analysis, scan.surface, begin, config.approach, first_width=width, landmarks=landmarks)
         settled = register_frame(analysis, scan, there, config=_dense_alone(config.stiff)).vertices
         return register_frame(analysis, scan, settled, config=_dense_alone(own)).vertices
 
-    def both() -> bool:
-        return (landmarks is None and tried.add("near", start, near)) or tried.add("far", start, first)
+    def far(begin: np.ndarray) -> bool:
+        return tried.add("far", begin, lambda: drawn(begin, config.approach.width[0]))
 
-    def first() -> np.ndarray:
-        return far(config.approach.width[0])
-
-    if config.lengths != "free" and both():
+    movable = config.align == "auto" and landmarks is None
+    if config.lengths == "free":
+        return _moved_there(start, scan) if movable else start
+    if landmarks is None and near(start):
+        return start
+    elsewhere = tried.fault is not None
+    moved = _moved_there(start, scan) if movable and elsewhere else start
+    if moved is start and far(start):
         return start
     if tried.fault is not None and config.align == "none":
         raise tried.fault
-    if config.align == "auto" and landmarks is None:
+    if movable and not elsewhere:
         moved = _moved_there(start, scan)
-        if moved is not start:
-            start = moved
-            if config.lengths != "free" and both():
-                return start
-    if config.lengths != "free" and tried.swung:
+    if moved is not start and (near(moved) or far(moved)):
+        return moved
+    if tried.swung:
         start = tried.best.fit.start
-        tried.add("wide", start, lambda: far(config.approach.wider))
-    return start
+        tried.add("wide", start, lambda: drawn(start, config.approach.wider))
+        return start
+    return moved
 
 
 def _freeing_lengths(tried: _Attempts, start: np.ndarray) -> None:
@@ -291,7 +297,7 @@ def judge(
         (
             "share of the template far from the scan",
             lost,
-            np.inf,
+            config.lost_check_percent,
             config.lost_fail_percent if unreached else np.inf,
             " %",
         ),

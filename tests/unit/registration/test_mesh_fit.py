@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from capture4d.geometry.mesh import submesh
 from capture4d.types import GarmentScan, Mesh
-from registration.config import ScanFitConfig
+from registration import mesh_fit
+from registration.config import MeshRegistrationConfig, ScanFitConfig
 from registration.correspondences import mesh_normals
 from registration.mesh_fit import judge
 from registration.quality import assess
@@ -40,7 +41,7 @@ def test_what_has_swung_is_to_be_checked(move, doubted: bool, garment, scan_of, 
 
 
 @pytest.mark.parametrize(("off", "lost"), [(0.004, True), (0.0, False)])
-def test_a_part_that_went_elsewhere_has_failed_and_what_is_not_scanned_has_not(
+def test_a_part_that_went_elsewhere_has_failed_and_what_is_not_scanned_is_to_be_checked(
     off: float, lost: bool, garment, scan_of, config
 ) -> None:
     """The scan shows the lower part; the upper one lies elsewhere, and the rest upon the scan, or 4 mm beside it."""
@@ -54,5 +55,29 @@ def test_a_part_that_went_elsewhere_has_failed_and_what_is_not_scanned_has_not(
     vertices[analysis.rest[:, 1] > 0.32, 0] += 0.3
     quality = replace(assess(analysis, scan, vertices, config.quality), verdict="good", reasons=())
     verdict, reasons = judge(quality, analysis, scan, vertices, ScanFitConfig(), start=analysis.rest)
-    assert (verdict == "failed") == lost
-    assert any("far from the scan" in reason for reason in reasons) == lost
+    assert verdict == ("failed" if lost else "check")
+    assert any("far from the scan" in reason for reason in reasons)
+
+
+@pytest.mark.parametrize("off_m", [0.0, 3.0])
+def test_where_nothing_lies_near_the_way_from_afar_starts_from_a_rigid_motion_alone(
+    off_m: float, garment, scan_of, config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No way is said to reach the scan, so that all of them are tried."""
+    starts = []
+
+    def approach(analysis, surface, start, *_, **__) -> np.ndarray:
+        starts.append(start)
+        return start
+
+    monkeypatch.setattr(mesh_fit, "approach", approach)
+    monkeypatch.setattr(mesh_fit, "_reaches", lambda *_: False)
+    scan = scan_of(lambda points: points + np.array([off_m, 0.0, 0.0]))
+    rest = garment.template.vertices.astype(np.float64)
+    few = replace(config, dense=replace(config.dense, cold=replace(config.dense.cold, steps=1)))
+    few = replace(few, coarse=replace(config.coarse, cold=replace(config.coarse.cold, steps=1)))
+    mesh_fit.fit_mesh(garment, scan, rest, MeshRegistrationConfig(lengths="kept", registration=few, stiff=few))
+    assert starts
+    assert np.allclose(starts[0], rest) == (off_m == 0.0)
+    for start in starts:
+        assert abs(start[:, 0].mean() - scan.mesh.vertices[:, 0].mean()) < 0.1
