@@ -24,7 +24,8 @@ from capture4d.geometry.mesh import unique_edges, vertex_normals
 from capture4d.geometry.ray_casting import TriangleScene
 from capture4d.heavy_imports import import_warp
 from capture4d.types import PoseSequence
-from data_synth.cloth.patterns import PanelMesh, Pattern, smooth_noise
+from data_synth.cloth.panels import Pattern
+from data_synth.cloth.patterns import PanelMesh, smooth_noise
 from data_synth.config import Fabric, SimulationConfig
 
 __all__ = ["approach_poses", "dress", "simulate"]
