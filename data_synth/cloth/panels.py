@@ -11,7 +11,18 @@ from itertools import pairwise
 
 import numpy as np
 
-__all__ = ["Edge", "Panel", "Pattern", "bezier", "curve_length", "lay_out", "line", "polygon_area", "resample"]
+__all__ = [
+    "Edge",
+    "Panel",
+    "Pattern",
+    "bezier",
+    "curve_length",
+    "lay_out",
+    "line",
+    "mirrored_name",
+    "polygon_area",
+    "resample",
+]
 
 LAYOUT_GAP_M = 0.05
 """Free space between panels of the plane domain."""
@@ -86,3 +97,9 @@ def resample(curve: np.ndarray, segments: int) -> np.ndarray:
     along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
     wanted = np.linspace(0, along[-1], segments + 1)
     return np.stack([np.interp(wanted, along, curve[:, axis]) for axis in range(2)], axis=1)
+
+
+def mirrored_name(name: str) -> str:
+    """The name of a panel's, or an edge's, mirror image: left is right."""
+    swapped = {"left": "right", "right": "left"}
+    return "_".join(swapped.get(word, word) for word in name.split("_"))

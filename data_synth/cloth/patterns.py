@@ -17,12 +17,13 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import Delaunay, KDTree
+from scipy.spatial import KDTree
 
 from capture4d.geometry.mesh import boundary_loops
-from data_synth.cloth.panels import Pattern, curve_length, polygon_area, resample
+from data_synth.cloth.panels import Edge, Pattern, curve_length, polygon_area, resample
+from data_synth.cloth.triangulation import mirrored_vertices, triangulate, triangulate_mirrored
 
-__all__ = ["PanelMesh", "grade", "locate", "mesh_pattern", "smooth_noise", "triangulate"]
+__all__ = ["PanelMesh", "grade", "locate", "mesh_pattern", "smooth_noise"]
 
 NOISE_PIXEL_M = 0.003
 GRADE_SEGMENTS = 40
@@ -51,6 +52,8 @@ class PanelMesh:
     """Vertices along each seam."""
     drafted_uv: np.ndarray | None = None
     """(V, 2) `vertex_uv` before the pattern was graded to somebody else."""
+    mirror: np.ndarray | None = None
+    """(V,) the mirror image of each vertex, on the body's other side; None where the mesh is not symmetric."""
 
     @property
     def noise_uv(self) -> np.ndarray:
@@ -63,7 +66,9 @@ class PanelMesh:
         return len(self.vertex_uv)
 
 
-def mesh_pattern(pattern: Pattern, vertex_count: int, rng: np.random.Generator) -> PanelMesh:
+def mesh_pattern(
+    pattern: Pattern, vertex_count: int, rng: np.random.Generator, *, symmetric: bool = False
+) -> PanelMesh:
     """Triangulate every panel at one edge length and weld the seams.
 
     A jittered hexagonal grid inside, equal arc-length samples along the outline, Delaunay, clipped to the panel.
@@ -71,29 +76,33 @@ def mesh_pattern(pattern: Pattern, vertex_count: int, rng: np.random.Generator) 
     Args:
         vertex_count: wanted number of vertices; met to a few percent.
         rng: jitters the grid, so that two seeds give two connectivities.
+        symmetric: the triangles of the body's left are those of its right, mirrored.
     """
     outlines = [np.concatenate([edge.curve for edge in panel.edges]) for panel in pattern.panels]
     area = sum(polygon_area(outline) for outline in outlines)
     spacing = np.sqrt(2 * area / (np.sqrt(3) * vertex_count))
-    seam_lengths: dict[str, list[float]] = {}
-    for panel in pattern.panels:
-        for edge in panel.edges:
-            seam_lengths.setdefault(edge.name, []).append(curve_length(edge.curve))
-    segments = {name: max(1, round(float(np.mean(lengths)) / spacing)) for name, lengths in seam_lengths.items()}
-
-    points, faces, face_panels, offset = [], [], [], 0
+    segments = _segments(pattern, spacing, symmetric=symmetric)
+    boundaries = [
+        np.concatenate([resample(edge.curve, segments[edge.name])[:-1] for edge in panel.edges])
+        for panel in pattern.panels
+    ]
+    triangulated = (
+        triangulate_mirrored(pattern, boundaries, spacing, rng)
+        if symmetric
+        else [triangulate(boundary, spacing, rng) for boundary in boundaries]
+    )
+    points, faces, face_panels, point_panels, offset = [], [], [], [], 0
     edge_vertices: dict[str, list[np.ndarray]] = {}
-    for index, panel in enumerate(pattern.panels):
-        boundary = np.concatenate([resample(edge.curve, segments[edge.name])[:-1] for edge in panel.edges])
+    for index, (panel_points, panel_faces) in enumerate(triangulated):
         start = 0
-        for edge in panel.edges:
-            ids = offset + (start + np.arange(segments[edge.name] + 1)) % len(boundary)
+        for edge in pattern.panels[index].edges:
+            ids = offset + (start + np.arange(segments[edge.name] + 1)) % len(boundaries[index])
             edge_vertices.setdefault(edge.name, []).append(ids[::-1] if edge.reverse else ids)
             start += segments[edge.name]
-        panel_points, panel_faces = triangulate(boundary, spacing, rng)
         points.append(panel_points)
         faces.append(panel_faces + offset)
         face_panels.append(np.full(len(panel_faces), index))
+        point_panels.append(np.full(len(panel_points), index))
         offset += len(panel_points)
     plane, corners = np.concatenate(points), np.concatenate(faces)
 
@@ -127,7 +136,27 @@ def mesh_pattern(pattern: Pattern, vertex_count: int, rng: np.random.Generator) 
         vertex_faces=some_face[first],
         loops={name: loops[name] for name in pattern.borders},
         seams={name: welded[sides[0]] for name, sides in edge_vertices.items() if len(sides) == 2},
+        mirror=welded[mirrored_vertices(pattern, np.concatenate(point_panels), plane)[first]] if symmetric else None,
     )
+
+
+def _segments(pattern: Pattern, spacing: float, *, symmetric: bool) -> dict[str, int]:
+    """Into how many sides the edges of each name are cut."""
+    lengths: dict[str, list[float]] = {}
+    across: set[str] = set()
+    for panel in pattern.panels:
+        for edge in panel.edges:
+            lengths.setdefault(edge.name, []).append(curve_length(edge.curve))
+            if symmetric and _crosses_middle(edge, panel.origin):
+                across.add(edge.name)
+    cut = {name: max(1, round(float(np.mean(each)) / spacing)) for name, each in lengths.items()}
+    return {name: count + count % 2 if name in across else count for name, count in cut.items()}
+
+
+def _crosses_middle(edge: Edge, origin: np.ndarray) -> bool:
+    """Whether an edge lies on both sides of its panel's middle, and so needs a vertex on it."""
+    u = edge.curve[:, 0] - origin[0]
+    return bool(u.min() < -1e-6 and u.max() > 1e-6)
 
 
 def grade(mesh: PanelMesh, drafted: Pattern, graded: Pattern) -> PanelMesh:
@@ -170,43 +199,6 @@ def _carried(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarr
         border = (1 - part) * end[side] + part * np.roll(end, -1, axis=0)[side]
         result[chunk] = np.where((distance[rows, side] < ON_OUTLINE_M)[:, None], border, inner)
     return result
-
-
-def triangulate(boundary: np.ndarray, spacing: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Delaunay triangles of a polygon; its vertices come first and all its edges are kept.
-
-    No inner point lies in the diametral circle of a boundary edge, so the Delaunay triangulation holds each edge.
-    """
-    low, high = boundary.min(axis=0), boundary.max(axis=0)
-    rows = np.arange(low[1], high[1], spacing * np.sqrt(3) / 2)
-    columns = np.arange(low[0], high[0] + spacing, spacing)
-    grid = np.stack(np.meshgrid(columns, rows), axis=-1)
-    grid[1::2, :, 0] += spacing / 2
-    grid = grid.reshape(-1, 2)
-    grid = grid + rng.uniform(-0.18, 0.18, grid.shape) * spacing
-    fractions = np.linspace(0, 1, 8, endpoint=False)[:, None, None]
-    dense = (boundary * (1 - fractions) + np.roll(boundary, -1, axis=0) * fractions).reshape(-1, 2)
-    grid = grid[_inside(grid, boundary)]
-    clear, _ = KDTree(dense).query(grid, distance_upper_bound=0.6 * spacing)
-    points = np.concatenate([boundary, grid[np.isinf(clear)]])
-    faces = Delaunay(points).simplices
-    a, b, c = points[faces].transpose(1, 0, 2)
-    u, v = b - a, c - a
-    doubled_area = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
-    faces[doubled_area < 0] = faces[doubled_area < 0][:, ::-1]
-    solid = np.abs(doubled_area) > 1e-3 * spacing**2  # not a sliver of collinear outline points
-    return points, faces[solid & _inside(points[faces].mean(axis=1), boundary)]
-
-
-def _inside(points: np.ndarray, polygon: np.ndarray) -> np.ndarray:
-    """Even-odd rule, (N,) bool."""
-    inside = np.zeros(len(points), bool)
-    x, y = points.T
-    for (x0, y0), (x1, y1) in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
-        if y0 != y1:
-            crosses = (y0 > y) != (y1 > y)
-            inside ^= crosses & (x < x0 + (y - y0) * (x1 - x0) / (y1 - y0))
-    return inside
 
 
 def locate(mesh: PanelMesh, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -25,24 +25,35 @@ def tshirt_pattern(shaped: ShapedBody, style: GarmentStyle) -> Pattern:
     """
     joint = dict(zip(shaped.body.joint_names, shaped.joints, strict=True))
     arm_length = float(np.linalg.norm(joint["lowerarm01.L"] - joint["upperarm01.L"]))
-    return shirt_pattern(shaped, style, sleeve_m=style.sleeve_length * arm_length, cuff=TSHIRT_CUFF)
+    return shirt_pattern(
+        shaped,
+        size=style.size,
+        ease=style.ease,
+        hem_drop_m=style.hem_drop_m,
+        sleeve_m=style.sleeve_length * arm_length,
+        cuff=TSHIRT_CUFF,
+    )
 
 
-def shirt_pattern(shaped: ShapedBody, style: GarmentStyle, *, sleeve_m: float, cuff: float) -> Pattern:
+def shirt_pattern(
+    shaped: ShapedBody, *, size: float, ease: float, hem_drop_m: float, sleeve_m: float, cuff: float
+) -> Pattern:
     """Draft a shirt for a body from its joints and chest girth.
 
     Args:
         shaped: the person, in the rest pose.
-        style: size, ease and hem height; the sleeve's length is not looked at.
+        size: scale of the draft's widths; 1 fits the person before ease.
+        ease: girth beyond the chest's, as a fraction of it.
+        hem_drop_m: how far below the hip joint the hem lies.
         sleeve_m: underarm length of the sleeve.
         cuff: width of the sleeve at the cuff, as a fraction of that at the underarm.
     """
     joint = dict(zip(shaped.body.joint_names, shaped.joints, strict=True))
-    half = _chest_girth(shaped) * style.size * (1 + style.ease) / 4
+    half = _chest_girth(shaped) * size * (1 + ease) / 4
     shoulder = (abs(joint["upperarm01.L"][0]) + 0.012, joint["upperarm01.L"][1] + 0.045)
-    underarm_y = shoulder[1] - style.size * (0.175 + 0.05 * style.ease)
-    hem_y = joint["root"][1] - style.hem_drop_m
-    neck = (0.082 * style.size, shoulder[1] + 0.035)
+    underarm_y = shoulder[1] - size * (0.175 + 0.05 * ease)
+    hem_y = joint["root"][1] - hem_drop_m
+    neck = (0.082 * size, shoulder[1] + 0.035)
     armhole = _armhole(half, shoulder, underarm_y)
     panels = (
         _torso_panel("front", armhole, hem_y, neck, neck_depth=0.085),
