@@ -79,4 +79,4 @@ def test_a_style_or_shape_that_is_none_is_refused(tmp_path: Path, changes: dict,
 def test_drapes_are_split_at_random_and_each_is_in_one_part():
     parts = stage.split_drapes(range(1, 101), (0.1, 0.2), np.random.default_rng(0))
     assert {name: len(part) for name, part in parts.items()} == {"validation": 10, "test": 20, "train": 70}
-    assert sorted(sum(parts.values(), [])) == list(range(1, 101))
+    assert sorted(number for part in parts.values() for number in part) == list(range(1, 101))
