@@ -21,7 +21,7 @@ from capture4d.geometry.triangles import closest_in_triangle, row3
 from capture4d.heavy_imports import njit
 from data_synth.drapes.solver import Planes
 
-__all__ = ["BodyParts", "Surface", "Wearing"]
+__all__ = ["BESIDE_COSINE", "BodyParts", "Surface", "Wearing"]
 
 BESIDE_M, BESIDE_COSINE = 0.01, 0.7
 """Behind its half plane and farther than this from the skin, in a direction so far from the normal's, a vertex is not

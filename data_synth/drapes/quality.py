@@ -9,13 +9,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture4d.body.skinning import with_pose
-from capture4d.geometry.mesh import edge_lengths, face_areas
-from capture4d.geometry.ray_casting import TriangleScene
+from capture4d.body.skinning import PosedBody, with_pose
+from capture4d.geometry.mesh import edge_lengths, face_areas, vertex_normals
+from capture4d.geometry.ray_casting import TriangleScene, barycentric
 from capture4d.geometry.triangles import self_intersections
+from data_synth.drapes.collision import BESIDE_COSINE
 from data_synth.drapes.draping import Drape, Draper
 
-__all__ = ["DrapeQuality", "face_area_ratios", "measure_drape"]
+__all__ = ["DrapeQuality", "face_area_ratios", "inside_parts", "measure_drape"]
 
 AREA_LIMITS = (0.25, 2.0)
 """A face smaller or larger than these shares of its area on the pattern is crushed or overstretched."""
@@ -58,7 +59,8 @@ def measure_drape(draper: Draper, rotations: np.ndarray, drape: Drape) -> DrapeQ
     areas = face_area_ratios(draper, drape.vertices)
     stretch = edge_lengths(drape.vertices, draper.sheet.edges) / draper.sheet.lengths
     p99 = float(np.percentile(stretch, 99))
-    inside = _inside_percent(draper, rotations, drape.vertices)
+    body = with_pose(draper.person, rotations, np.zeros(3))
+    inside = 100 * float(inside_parts(body, draper.part_masks, draper.contacts, drape.vertices).mean())
     cut = 100 * float(self_intersections(drape.vertices, draper.mesh.faces).mean())
     reasons = []
     crushed, over = int((areas < AREA_LIMITS[0]).sum()), int((areas > AREA_LIMITS[1]).sum())
@@ -77,20 +79,31 @@ def measure_drape(draper: Draper, rotations: np.ndarray, drape: Drape) -> DrapeQ
     )
 
 
-def _inside_percent(draper: Draper, rotations: np.ndarray, vertices: np.ndarray) -> float:
-    """Share of the vertices inside the closed body, over whose nearest skin their own part lies as well.
+def inside_parts(
+    body: PosedBody, masks: np.ndarray, contacts: tuple[np.ndarray, np.ndarray], points: np.ndarray
+) -> np.ndarray:
+    """(V,) bool: vertices of a garment, (V, 3), more than a millimetre inside a part of the body that they meet.
 
-    A vertex of the trunk inside an arm is not counted: it meets the trunk alone.
+    Inside the closed body, and behind the nearest skin of the part. A vertex of the trunk inside an arm is not counted:
+    it meets the trunk alone.
+
+    Args:
+        masks: (P, B) bool, which vertices of the body belong to each part.
+        contacts: the garment's vertices, and the part each meets, both (C,).
     """
-    body = with_pose(draper.person, rotations, np.zeros(3))
     faces, surface = body.shaped.body.template.faces, body.vertices()
-    scene = TriangleScene((surface, faces))
-    suspects = np.flatnonzero(scene.signed_distances(vertices) < -INSIDE_M)
-    if not len(suspects):
-        return 0.0
-    under = faces[scene.nearest(vertices[suspects]).faces]
-    masks = draper.part_masks
-    meets = np.zeros((len(masks), len(vertices)), bool)
-    meets[draper.contacts[1], draper.contacts[0]] = True
-    counted = (masks[:, under].all(axis=2) & meets[:, suspects]).any(axis=0)
-    return 100 * float(counted.sum()) / len(vertices)
+    deep = TriangleScene((surface, faces)).signed_distances(points) < -INSIDE_M
+    inside, normals = np.zeros(len(points), bool), vertex_normals(surface, faces)
+    for part, mask in enumerate(masks):
+        chosen = contacts[0][contacts[1] == part]
+        chosen = chosen[deep[chosen]]
+        if not len(chosen):
+            continue
+        own = faces[mask[faces].all(axis=1)]
+        near = TriangleScene((surface, own)).nearest(points[chosen])
+        normal = np.einsum("nk,nkx->nx", barycentric(near.uv), normals[own[near.faces]])
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        offsets = points[chosen] - near.points
+        depth = -np.einsum("nx,nx->n", offsets, normal)
+        inside[chosen] |= depth > np.maximum(INSIDE_M, BESIDE_COSINE * np.linalg.norm(offsets, axis=1))
+    return inside
