@@ -207,6 +207,7 @@ class DrapesConfig:
     """A set of drapes: one garment of one style on one person, in many poses."""
 
     garment: GarmentName = "tshirt"
+    """What is draped; each kind has a pattern and style parameters of its own."""
     samples: Count = 100
     """Poses to drape; those of bad drapes are kept and marked, and belong to no part of the split."""
     seed: Seed = 0
