@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -52,6 +53,26 @@ def test_what_a_kill_left_is_finished_to_the_same_bytes(tmp_path: Path):
     assert stage.run(tmp_path / "a", CONFIG).digest == first.digest
     assert shard.read_bytes() == before
     assert (tmp_path / "a" / "shards" / "000001.npz").stat().st_mtime_ns == kept
+
+
+def test_shards_are_the_same_bytes_in_any_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, backwards: Callable[..., Iterator[None]]
+):
+    first = stage.run(tmp_path / "a", CONFIG)
+    monkeypatch.setattr(stage, "run_jobs", backwards)
+    assert stage.run(tmp_path / "b", CONFIG).digest == first.digest
+
+
+@pytest.fixture
+def backwards() -> Callable[..., Iterator[None]]:
+    """Runs jobs from the last to the first, as other workers might."""
+
+    def run(do, jobs, *, prepare, **_):
+        prepared = prepare()
+        for job in reversed(jobs):
+            yield do(prepared, job)
+
+    return run
 
 
 def test_another_seed_is_another_set_and_not_mixed_with_this(tmp_path: Path):
