@@ -9,9 +9,10 @@ from capture4d.errors import InputError
 from capture4d.runs.run_log import logged_stage
 from capture4d.runs.stage import StageResult
 from data_synth.config import PRESETS, TRAINING_SETS, BoardConfig, SynthConfig, TrainingSetConfig
+from data_synth.drapes.config import DrapesConfig
 from data_synth.scanner.config import ScanConfig
 
-__all__ = ["scan", "synth", "synth_board"]
+__all__ = ["scan", "synth", "synth_board", "synth_drapes"]
 
 Place: TypeAlias = str | Path
 
@@ -71,3 +72,17 @@ def synth_board(
     from data_synth.board.stage import run as stage
 
     return stage(Path(rig), Path(images), config or BoardConfig(), workers=workers, overwrite=overwrite)
+
+
+@logged_stage("synth-drapes")
+def synth_drapes(
+    output: Place, config: DrapesConfig | None = None, *, workers: int = 1, overwrite: bool = False
+) -> StageResult:
+    """Drape a garment over a still body in many poses, to learn from; `failed` are the drapes that are not fit for it.
+
+    Raises:
+        InputError: the style or the shape is none, or the folder holds something else.
+    """
+    from data_synth.drapes.stage import run as stage
+
+    return stage(Path(output), config or DrapesConfig(), workers=workers, overwrite=overwrite)

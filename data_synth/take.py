@@ -16,8 +16,10 @@ from capture4d.body.anny import load_anny
 from capture4d.body.skinning import PosedBody, ShapedBody, pose_frame, with_shape
 from capture4d.motions.retargeting import pose_sequence
 from capture4d.types import Mesh, PoseSequence, Rig
-from data_synth.cloth.patterns import PanelMesh, Pattern, grade, mesh_pattern, tshirt_pattern
+from data_synth.cloth.panels import Pattern
+from data_synth.cloth.patterns import PanelMesh, grade, mesh_pattern
 from data_synth.cloth.simulation import approach_poses, dress, simulate
+from data_synth.cloth.tshirt import tshirt_pattern
 from data_synth.cloth.wrinkle_relaxation import WrinkleMesh, relax_frame, wrinkle_mesh
 from data_synth.config import FABRICS, SynthConfig
 from data_synth.motions import make_motion

@@ -21,6 +21,9 @@ SAMPLES = 2000
 """Points of either side that take part."""
 TRIM = 0.85
 """Share of the closest pairs that count: the scan may show more or less than the template."""
+AS_NEAR = 1.1
+"""Of two results whose distances differ by less than this factor the one that turns less counts: a shirt that was turned
+back to front lies as near to a moving one as the shirt itself."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,7 +57,8 @@ def align(
 ) -> Similarity:
     """Move the template onto the scan.
 
-    The start as given is one of the guesses, so that a pair that is already aligned stays so.
+    The start as given is one of the guesses, so that a pair that is already aligned stays so; and what turns less is
+    preferred to what is hardly nearer.
     """
     rng = np.random.default_rng(0)
     source = template[np.sort(rng.permutation(len(template))[:SAMPLES])]
@@ -62,9 +66,15 @@ def align(
     tree = KDTree(target)
     guesses = [Similarity(np.eye(3), np.zeros(3)), *_axis_guesses(source, target, with_scale)]
     tried = [_icp(guess, source, target, tree, with_scale, steps=8) for guess in guesses]
-    best = sorted(tried, key=lambda pair: pair[0])[:3]
-    finished = [_icp(guess, source, target, tree, with_scale, steps=60) for _, guess in best]
-    return min(finished, key=lambda pair: pair[0])[1]
+    unturned, others = tried[:2], sorted(tried[2:], key=lambda pair: pair[0])[:3]
+    finished = [_icp(guess, source, target, tree, with_scale, steps=60) for _, guess in (*unturned, *others)]
+    nearest = min(distance for distance, _ in finished)
+    return max((found for distance, found in finished if distance <= AS_NEAR * nearest), key=_unturned)
+
+
+def _unturned(motion: Similarity) -> float:
+    """Trace of the rotation: 3 if it does not turn, -1 by half a turn."""
+    return float(np.trace(motion.rotation))
 
 
 def _axis_guesses(source: np.ndarray, target: np.ndarray, with_scale: bool) -> list[Similarity]:

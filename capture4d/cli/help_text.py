@@ -27,7 +27,7 @@ _GROUPS: Mapping[str, Sequence[str]] = {
     ),
     "two meshes:": ("register-mesh",),
     "rigs:": ("calibrate", "check-rig", "convert-rig", "synth-board"),
-    "captures that nobody filmed:": ("demo", "synth", "scan"),
+    "captures that nobody filmed:": ("demo", "synth", "scan", "synth-drapes"),
     "files and this installation:": ("convert-body", "convert-poses", "doctor"),
 }  # fmt: skip
 
@@ -40,6 +40,10 @@ EXAMPLES: Mapping[str, Sequence[str]] = {
     ),
     "scan": ("scan meshes take --fps 30 --template template.obj",),
     "synth-board": ("synth-board capture/rig.json board --poses 16",),
+    "synth-drapes": (
+        "synth-drapes drapes --garment tshirt --samples 1000",
+        "synth-drapes skirts --garment skirt --style length_m=0.6 flare=1.8 --beta 1.0 -0.5",
+    ),
     "check": ("check capture", "check scans --fps 60 --units mm --garment-colour '#2f62c9' --fix"),
     "template": (
         "template shirt.obj --units cm --output capture/template.npz",

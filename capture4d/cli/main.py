@@ -24,7 +24,7 @@ from capture4d.cli.commands.files import ConvertBody, ConvertPoses, ConvertRig, 
 from capture4d.cli.commands.folders import Diff, Status
 from capture4d.cli.commands.models import Animate, Fit
 from capture4d.cli.commands.stages import Extract, Register, Report, Run, Track
-from capture4d.cli.commands.synthesis import Demo, Scan, Synth, SynthBoard
+from capture4d.cli.commands.synthesis import Demo, Scan, Synth, SynthBoard, SynthDrapes
 from capture4d.cli.commands.wrinkles import Compare, WrinklesApply, WrinklesMaps, WrinklesOffsets, WrinklesTrain
 from capture4d.cli.exit_codes import BAD_COMMAND_LINE, BAD_INPUT, GOOD
 from capture4d.cli.help_text import command_help, overview
@@ -45,6 +45,7 @@ COMMANDS: Mapping[str, Any] = {
     "synth": Synth,
     "scan": Scan,
     "synth-board": SynthBoard,
+    "synth-drapes": SynthDrapes,
     "check": Check,
     "template": Template,
     "extract": Extract,
@@ -263,7 +264,7 @@ def _log_folder(command: Any) -> Path | None:
     """The folder of a command's log: the work folder, or the model's; None of a command that writes anything else."""
     if isinstance(command, _WRITE_FILES) or not isinstance(command, StageOptions):
         return None
-    if isinstance(command, Synth | Scan | SynthBoard):  # equal settings give equal folders, byte for byte
+    if isinstance(command, Synth | Scan | SynthBoard | SynthDrapes):  # equal settings give equal folders, byte for byte
         return None
     if isinstance(command, Fit) and command.output is None:
         return next(iter(command.works), None)

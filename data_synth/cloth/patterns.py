@@ -1,4 +1,4 @@
-"""A parametric sewing pattern: a T-shirt of front, back and two set-in sleeves.
+"""Meshes of a sewing pattern, welded along its seams, and what is known of a point of cloth by its place on it.
 
 The pattern is a plane domain in metres, one outline per panel, laid out side by side. Every mesh of the garment, the
 coarse simulated one, the fine wrinkled one and the registration template, triangulates the same domain, so a point of
@@ -11,59 +11,25 @@ equal fractions of arc length, so that vertices of both sides coincide one to on
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
-from scipy.optimize import root_scalar
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import ConvexHull, Delaunay, KDTree
+from scipy.spatial import KDTree
 
-from capture4d.body.skinning import ShapedBody
 from capture4d.geometry.mesh import boundary_loops
-from data_synth.config import GarmentStyle
+from data_synth.cloth.panels import Edge, Pattern, curve_length, polygon_area, resample
+from data_synth.cloth.triangulation import mirrored_vertices, triangulate, triangulate_mirrored
 
-__all__ = ["PanelMesh", "Pattern", "grade", "locate", "mesh_pattern", "smooth_noise", "tshirt_pattern"]
+__all__ = ["PanelMesh", "grade", "locate", "mesh_pattern", "smooth_noise"]
 
-LAYOUT_GAP_M = 0.05
-"""Free space between panels of the plane domain."""
 NOISE_PIXEL_M = 0.003
 GRADE_SEGMENTS = 40
 """Sides of each edge of a panel for grading."""
 ON_OUTLINE_M = 5e-4
 """Nearer than this to the outline a point lies on it: curves are cut into straight sides."""
-
-
-@dataclass(frozen=True, slots=True)
-class Edge:
-    """One side of a panel: a densely sampled curve, (n, 2) metres, and the seam or border it belongs to."""
-
-    curve: np.ndarray
-    name: str
-    """Edges of the same name are sewn together; a name of `Pattern.borders` is an open border."""
-    reverse: bool = False
-    """Whether the seam runs against the curve."""
-
-
-@dataclass(frozen=True, slots=True)
-class Panel:
-    """A closed outline, counter-clockwise, made of edges; each starts where the one before ends."""
-
-    name: str
-    edges: tuple[Edge, ...]
-    origin: np.ndarray = field(default_factory=lambda: np.zeros(2))
-    """Where the draft's own origin lies in the plane domain."""
-
-
-@dataclass(frozen=True, slots=True)
-class Pattern:
-    """Panels in one plane domain."""
-
-    panels: tuple[Panel, ...]
-    borders: tuple[str, ...]
-    """Names of the open borders: the garment's boundary loops."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,6 +52,8 @@ class PanelMesh:
     """Vertices along each seam."""
     drafted_uv: np.ndarray | None = None
     """(V, 2) `vertex_uv` before the pattern was graded to somebody else."""
+    mirror: np.ndarray | None = None
+    """(V,) the mirror image of each vertex, on the body's other side; None where the mesh is not symmetric."""
 
     @property
     def noise_uv(self) -> np.ndarray:
@@ -98,142 +66,9 @@ class PanelMesh:
         return len(self.vertex_uv)
 
 
-def tshirt_pattern(shaped: ShapedBody, style: GarmentStyle) -> Pattern:
-    """Draft a T-shirt for a body from its joints and chest girth.
-
-    Args:
-        shaped: the person, in the rest pose.
-        style: size, sleeve length, ease and hem height.
-    """
-    joint = dict(zip(shaped.body.joint_names, shaped.joints, strict=True))
-    half = _chest_girth(shaped) * style.size * (1 + style.ease) / 4
-    shoulder = (abs(joint["upperarm01.L"][0]) + 0.012, joint["upperarm01.L"][1] + 0.045)
-    underarm_y = shoulder[1] - style.size * (0.175 + 0.05 * style.ease)
-    hem_y = joint["root"][1] - style.hem_drop_m
-    neck = (0.082 * style.size, shoulder[1] + 0.035)
-    armhole = _armhole(half, shoulder, underarm_y)
-    arm_length = float(np.linalg.norm(joint["lowerarm01.L"] - joint["upperarm01.L"]))
-    panels = (
-        _torso_panel("front", armhole, hem_y, neck, neck_depth=0.085),
-        _torso_panel("back", armhole, hem_y, neck, neck_depth=0.022),
-        _sleeve_panel("left", _length(armhole), style.sleeve_length * arm_length),
-        _sleeve_panel("right", _length(armhole), style.sleeve_length * arm_length),
-    )
-    return Pattern(_lay_out(panels), borders=("neck", "hem", "cuff_left", "cuff_right"))
-
-
-def _chest_girth(shaped: ShapedBody) -> float:
-    """Perimeter, metres, of the convex hull of the trunk's widest section between waist and armpit."""
-    names = shaped.body.joint_names
-    trunk = np.isin(
-        np.argmax(shaped.body.skin_weights, axis=1),
-        [i for i, name in enumerate(names) if name.startswith(("spine", "clavicle", "root"))],
-    )
-    height = shaped.joints[names.index("upperarm01.L")][1]
-    points = shaped.vertices[trunk]
-    girths = []
-    for level in np.linspace(height - 0.25, height - 0.08, 8):
-        section = points[np.abs(points[:, 1] - level) < 0.02]
-        if len(section) > 8:
-            girths.append(ConvexHull(section[:, [0, 2]]).area)
-    return float(max(girths))
-
-
-def _bezier(*control: tuple[float, float], count: int = 200) -> np.ndarray:
-    t = np.linspace(0, 1, count)[:, None]
-    points = [np.broadcast_to(np.asarray(point, float), (count, 2)) for point in control]
-    while len(points) > 1:
-        points = [(1 - t) * a + t * b for a, b in pairwise(points)]
-    return points[0]
-
-
-def _line(start: tuple[float, float], end: tuple[float, float]) -> np.ndarray:
-    return np.linspace(start, end, 50)
-
-
-def _length(curve: np.ndarray) -> float:
-    return float(np.linalg.norm(np.diff(curve, axis=0), axis=1).sum())
-
-
-def _armhole(half: float, shoulder: tuple[float, float], underarm_y: float) -> np.ndarray:
-    """From the underarm up to the shoulder tip, on the +u side."""
-    inner = shoulder[0] - 0.012
-    return _bezier(
-        (half, underarm_y), (inner + 0.02, underarm_y), (inner, underarm_y + 0.5 * (shoulder[1] - underarm_y)), shoulder
-    )
-
-
-def _torso_panel(
-    name: str,
-    armhole: np.ndarray,
-    hem_y: float,
-    neck: tuple[float, float],
-    neck_depth: float,
-) -> Panel:
-    """Front or back as seen from outside: +u is the body's left on the front and its right on the back."""
-    plus, minus = ("left", "right") if name == "front" else ("right", "left")
-    half, underarm_y = armhole[0]
-    mirror = np.array([-1.0, 1.0])
-    side = _line((half, hem_y), (half, underarm_y))
-    shoulder = _line(tuple(armhole[-1]), neck)
-    low = neck[1] - neck_depth
-    neckline = _bezier(neck, (neck[0] * 0.9, low), (neck[0] * 0.3, low), (0, low))
-    return Panel(
-        name,
-        (
-            Edge(_line((-half, hem_y), (half, hem_y)), f"hem|{name}"),
-            Edge(side, f"side_{plus}"),
-            Edge(armhole, f"armhole_{name}_{plus}"),
-            Edge(shoulder, f"shoulder_{plus}"),
-            Edge(np.concatenate([neckline, (neckline * mirror)[-2::-1]]), f"neck|{name}"),
-            Edge((shoulder * mirror)[::-1], f"shoulder_{minus}", reverse=True),
-            Edge((armhole * mirror)[::-1], f"armhole_{name}_{minus}", reverse=True),
-            Edge((side * mirror)[::-1], f"side_{minus}", reverse=True),
-        ),
-    )
-
-
-def _sleeve_panel(side: str, armhole_length: float, length: float) -> Panel:
-    """A sleeve laid flat, cap up, cuff down, as seen from outside; each half of the cap is as long as an armhole."""
-    plus, minus = ("back", "front") if side == "left" else ("front", "back")
-    cap_height = 0.42 * armhole_length
-
-    def cap(half_width: float) -> np.ndarray:
-        return _bezier(
-            (half_width, 0), (0.62 * half_width, 0.05 * cap_height), (0.5 * half_width, cap_height), (0, cap_height)
-        )
-
-    bracket = (0.3 * armhole_length, armhole_length)
-    half = float(root_scalar(lambda width: _length(cap(width)) - armhole_length, bracket=bracket).root)
-    cuff = 0.86 * half
-    mirror = np.array([-1.0, 1.0])
-    seam = _line((cuff, -length), (half, 0))
-    return Panel(
-        f"sleeve_{side}",
-        (
-            Edge(_line((-cuff, -length), (cuff, -length)), f"cuff_{side}|sleeve"),
-            Edge(seam, f"sleeve_{side}"),
-            Edge(cap(half), f"armhole_{plus}_{side}"),
-            Edge((cap(half) * mirror)[::-1], f"armhole_{minus}_{side}", reverse=True),
-            Edge((seam * mirror)[::-1], f"sleeve_{side}", reverse=True),
-        ),
-    )
-
-
-def _lay_out(panels: tuple[Panel, ...]) -> tuple[Panel, ...]:
-    """Move the panels side by side, lower edges at v = 0."""
-    placed, cursor = [], 0.0
-    for panel in panels:
-        outline = np.concatenate([edge.curve for edge in panel.edges])
-        low, high = outline.min(axis=0), outline.max(axis=0)
-        shift = np.array([cursor - low[0], -low[1]])
-        cursor += high[0] - low[0] + LAYOUT_GAP_M
-        edges = tuple(Edge(edge.curve + shift, edge.name, edge.reverse) for edge in panel.edges)
-        placed.append(Panel(panel.name, edges, origin=shift))
-    return tuple(placed)
-
-
-def mesh_pattern(pattern: Pattern, vertex_count: int, rng: np.random.Generator) -> PanelMesh:
+def mesh_pattern(
+    pattern: Pattern, vertex_count: int, rng: np.random.Generator, *, symmetric: bool = False
+) -> PanelMesh:
     """Triangulate every panel at one edge length and weld the seams.
 
     A jittered hexagonal grid inside, equal arc-length samples along the outline, Delaunay, clipped to the panel.
@@ -241,29 +76,33 @@ def mesh_pattern(pattern: Pattern, vertex_count: int, rng: np.random.Generator) 
     Args:
         vertex_count: wanted number of vertices; met to a few percent.
         rng: jitters the grid, so that two seeds give two connectivities.
+        symmetric: the triangles of the body's left are those of its right, mirrored.
     """
     outlines = [np.concatenate([edge.curve for edge in panel.edges]) for panel in pattern.panels]
-    area = sum(_polygon_area(outline) for outline in outlines)
+    area = sum(polygon_area(outline) for outline in outlines)
     spacing = np.sqrt(2 * area / (np.sqrt(3) * vertex_count))
-    seam_lengths: dict[str, list[float]] = {}
-    for panel in pattern.panels:
-        for edge in panel.edges:
-            seam_lengths.setdefault(edge.name, []).append(_length(edge.curve))
-    segments = {name: max(1, round(float(np.mean(lengths)) / spacing)) for name, lengths in seam_lengths.items()}
-
-    points, faces, face_panels, offset = [], [], [], 0
+    segments = _segments(pattern, spacing, symmetric=symmetric)
+    boundaries = [
+        np.concatenate([resample(edge.curve, segments[edge.name])[:-1] for edge in panel.edges])
+        for panel in pattern.panels
+    ]
+    triangulated = (
+        triangulate_mirrored(pattern, boundaries, spacing, rng)
+        if symmetric
+        else [triangulate(boundary, spacing, rng) for boundary in boundaries]
+    )
+    points, faces, face_panels, point_panels, offset = [], [], [], [], 0
     edge_vertices: dict[str, list[np.ndarray]] = {}
-    for index, panel in enumerate(pattern.panels):
-        boundary = np.concatenate([_resample(edge.curve, segments[edge.name])[:-1] for edge in panel.edges])
+    for index, (panel_points, panel_faces) in enumerate(triangulated):
         start = 0
-        for edge in panel.edges:
-            ids = offset + (start + np.arange(segments[edge.name] + 1)) % len(boundary)
+        for edge in pattern.panels[index].edges:
+            ids = offset + (start + np.arange(segments[edge.name] + 1)) % len(boundaries[index])
             edge_vertices.setdefault(edge.name, []).append(ids[::-1] if edge.reverse else ids)
             start += segments[edge.name]
-        panel_points, panel_faces = _triangulate(boundary, spacing, rng)
         points.append(panel_points)
         faces.append(panel_faces + offset)
         face_panels.append(np.full(len(panel_faces), index))
+        point_panels.append(np.full(len(panel_points), index))
         offset += len(panel_points)
     plane, corners = np.concatenate(points), np.concatenate(faces)
 
@@ -297,7 +136,27 @@ def mesh_pattern(pattern: Pattern, vertex_count: int, rng: np.random.Generator) 
         vertex_faces=some_face[first],
         loops={name: loops[name] for name in pattern.borders},
         seams={name: welded[sides[0]] for name, sides in edge_vertices.items() if len(sides) == 2},
+        mirror=welded[mirrored_vertices(pattern, np.concatenate(point_panels), plane)[first]] if symmetric else None,
     )
+
+
+def _segments(pattern: Pattern, spacing: float, *, symmetric: bool) -> dict[str, int]:
+    """Into how many sides the edges of each name are cut."""
+    lengths: dict[str, list[float]] = {}
+    across: set[str] = set()
+    for panel in pattern.panels:
+        for edge in panel.edges:
+            lengths.setdefault(edge.name, []).append(curve_length(edge.curve))
+            if symmetric and _crosses_middle(edge, panel.origin):
+                across.add(edge.name)
+    cut = {name: max(1, round(float(np.mean(each)) / spacing)) for name, each in lengths.items()}
+    return {name: count + count % 2 if name in across else count for name, count in cut.items()}
+
+
+def _crosses_middle(edge: Edge, origin: np.ndarray) -> bool:
+    """Whether an edge lies on both sides of its panel's middle, and so needs a vertex on it."""
+    u = edge.curve[:, 0] - origin[0]
+    return bool(u.min() < -1e-6 and u.max() > 1e-6)
 
 
 def grade(mesh: PanelMesh, drafted: Pattern, graded: Pattern) -> PanelMesh:
@@ -309,7 +168,7 @@ def grade(mesh: PanelMesh, drafted: Pattern, graded: Pattern) -> PanelMesh:
     vertex_panels = mesh.face_panels[mesh.vertex_faces]
     for index, (start, end) in enumerate(zip(drafted.panels, graded.panels, strict=True)):
         outlines = [
-            np.concatenate([_resample(edge.curve, GRADE_SEGMENTS)[:-1] for edge in panel.edges])
+            np.concatenate([resample(edge.curve, GRADE_SEGMENTS)[:-1] for edge in panel.edges])
             for panel in (start, end)
         ]
         faces, vertices = mesh.face_panels == index, vertex_panels == index
@@ -340,55 +199,6 @@ def _carried(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarr
         border = (1 - part) * end[side] + part * np.roll(end, -1, axis=0)[side]
         result[chunk] = np.where((distance[rows, side] < ON_OUTLINE_M)[:, None], border, inner)
     return result
-
-
-def _polygon_area(outline: np.ndarray) -> float:
-    x, y = outline.T
-    return 0.5 * float(np.abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)))
-
-
-def _resample(curve: np.ndarray, segments: int) -> np.ndarray:
-    """(segments + 1, 2) points at equal arc length."""
-    along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
-    wanted = np.linspace(0, along[-1], segments + 1)
-    return np.stack([np.interp(wanted, along, curve[:, axis]) for axis in range(2)], axis=1)
-
-
-def _triangulate(boundary: np.ndarray, spacing: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Delaunay triangles of a polygon; its vertices come first and all its edges are kept.
-
-    No inner point lies in the diametral circle of a boundary edge, so the Delaunay triangulation holds each edge.
-    """
-    low, high = boundary.min(axis=0), boundary.max(axis=0)
-    rows = np.arange(low[1], high[1], spacing * np.sqrt(3) / 2)
-    columns = np.arange(low[0], high[0] + spacing, spacing)
-    grid = np.stack(np.meshgrid(columns, rows), axis=-1)
-    grid[1::2, :, 0] += spacing / 2
-    grid = grid.reshape(-1, 2)
-    grid = grid + rng.uniform(-0.18, 0.18, grid.shape) * spacing
-    fractions = np.linspace(0, 1, 8, endpoint=False)[:, None, None]
-    dense = (boundary * (1 - fractions) + np.roll(boundary, -1, axis=0) * fractions).reshape(-1, 2)
-    grid = grid[_inside(grid, boundary)]
-    clear, _ = KDTree(dense).query(grid, distance_upper_bound=0.6 * spacing)
-    points = np.concatenate([boundary, grid[np.isinf(clear)]])
-    faces = Delaunay(points).simplices
-    a, b, c = points[faces].transpose(1, 0, 2)
-    u, v = b - a, c - a
-    doubled_area = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
-    faces[doubled_area < 0] = faces[doubled_area < 0][:, ::-1]
-    solid = np.abs(doubled_area) > 1e-3 * spacing**2  # not a sliver of collinear outline points
-    return points, faces[solid & _inside(points[faces].mean(axis=1), boundary)]
-
-
-def _inside(points: np.ndarray, polygon: np.ndarray) -> np.ndarray:
-    """Even-odd rule, (N,) bool."""
-    inside = np.zeros(len(points), bool)
-    x, y = points.T
-    for (x0, y0), (x1, y1) in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
-        if y0 != y1:
-            crosses = (y0 > y) != (y1 > y)
-            inside ^= crosses & (x < x0 + (y - y0) * (x1 - x0) / (y1 - y0))
-    return inside
 
 
 def locate(mesh: PanelMesh, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -12,6 +12,7 @@ import numpy as np
 from capture4d.geometry.mesh import face_areas
 from capture4d.geometry.ray_casting import TriangleScene
 from data_synth.cloth.patterns import PanelMesh
+from data_synth.cloth.stencils import rest_areas
 from data_synth.cloth.wrinkle_relaxation import WrinkleMesh
 
 __all__ = ["ClothQuality", "measure_cloth"]
@@ -42,9 +43,7 @@ def measure_cloth(
     """Measure a fine frame, (V, 3) metres, against its pattern and the body surface, (B, 3)."""
     ends = vertices[wrinkles.edges]
     stretch = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / wrinkles.rest_lengths
-    first, second = mesh.uv[:, 1] - mesh.uv[:, 0], mesh.uv[:, 2] - mesh.uv[:, 0]
-    rest_area = 0.5 * np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
-    area = face_areas(vertices.astype(np.float64), mesh.faces) / rest_area
+    area = face_areas(vertices.astype(np.float64), mesh.faces) / rest_areas(mesh)
     depth = -TriangleScene((surface, body_faces)).signed_distances(vertices)
     p99 = float(np.percentile(stretch, 99))
     crushed, over = int((area < AREA_LIMITS[0]).sum()), int((area > AREA_LIMITS[1]).sum())

@@ -24,10 +24,11 @@ from capture4d.geometry.mesh import unique_edges, vertex_normals
 from capture4d.geometry.ray_casting import TriangleScene
 from capture4d.heavy_imports import import_warp
 from capture4d.types import PoseSequence
-from data_synth.cloth.patterns import PanelMesh, Pattern, smooth_noise
+from data_synth.cloth.panels import Pattern
+from data_synth.cloth.patterns import PanelMesh, smooth_noise
 from data_synth.config import Fabric, SimulationConfig
 
-__all__ = ["approach_poses", "dress", "simulate"]
+__all__ = ["approach_poses", "dress", "dressing_rotations", "simulate"]
 
 DRESSING_ARM_RAISE_DEG = 42.0
 """Raises the arms of the rest pose to about the horizontal, so that a flat T fits over them."""
@@ -62,7 +63,13 @@ def approach_poses(shaped: ShapedBody, poses: PoseSequence, config: SimulationCo
     return [moving[0]] * config.calm_frames + moving + [moving[-1]] * config.rest_frames
 
 
-def dress(shaped: ShapedBody, mesh: PanelMesh, pattern: Pattern, first: PosedBody) -> np.ndarray:
+def dress(
+    shaped: ShapedBody,
+    mesh: PanelMesh,
+    pattern: Pattern,
+    first: PosedBody,
+    rotations: np.ndarray | None = None,
+) -> np.ndarray:
     """Hang the panels around the body in the dressing pose.
 
     Front and back stand off the trunk as pillows that meet at the side seams; sleeves are tubes around the arms. The
@@ -70,10 +77,12 @@ def dress(shaped: ShapedBody, mesh: PanelMesh, pattern: Pattern, first: PosedBod
 
     Args:
         first: the first of `approach_poses`; only the place of its root matters.
+        rotations: joints of the dressing pose, (J, 3, 3), the arms held out; those of `dressing_rotations` if None.
     Returns:
         Vertex positions (V, 3), metres.
     """
-    surface = with_pose(shaped, dressing_rotations(shaped), np.zeros(3)).vertices()
+    rotations = dressing_rotations(shaped) if rotations is None else rotations
+    surface = with_pose(shaped, rotations, np.zeros(3)).vertices()
     body = _Surface(TriangleScene((surface, shaped.body.template.faces)))
     names = shaped.body.joint_names
     shoulder = shaped.joints[names.index("upperarm01.L")]

@@ -19,9 +19,10 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from capture4d.geometry.mesh import edges_of_faces, unique_edges, vertex_adjacency, vertex_normals
+from capture4d.geometry.mesh import vertex_adjacency, vertex_normals
 from capture4d.geometry.ray_casting import TriangleScene, barycentric
 from data_synth.cloth.patterns import PanelMesh, locate, smooth_noise
+from data_synth.cloth.stencils import hinges, rest_lengths
 from data_synth.config import Fabric, RelaxationConfig
 
 __all__ = ["BodyPlanes", "BodySurface", "WrinkleMesh", "relax_frame", "wrinkle_mesh"]
@@ -70,8 +71,8 @@ def wrinkle_mesh(coarse: PanelMesh, fine: PanelMesh, config: RelaxationConfig, r
         rng: draws the imperfection; one seed is one garment.
     """
     lift_faces, lift_weights = locate(coarse, fine.vertex_uv)
-    edges, rest_lengths = _rest_lengths(fine)
-    hinges, weights = _hinges(fine)
+    edges, lengths = rest_lengths(fine)
+    stencils, weights = hinges(fine)
     adjacency = vertex_adjacency(fine.faces, fine.vertex_count)
     neighbour = adjacency.indices[adjacency.indptr[:-1]]
     return WrinkleMesh(
@@ -81,68 +82,11 @@ def wrinkle_mesh(coarse: PanelMesh, fine: PanelMesh, config: RelaxationConfig, r
         lift_weights=lift_weights,
         tangent_edges=np.stack([np.arange(fine.vertex_count), neighbour], axis=1),
         edges=edges.astype(np.int32),
-        rest_lengths=rest_lengths.astype(np.float32),
-        hinges=hinges.astype(np.int32),
+        rest_lengths=lengths.astype(np.float32),
+        hinges=stencils.astype(np.int32),
         hinge_weights=weights.astype(np.float32),
         imperfection=smooth_noise(fine.noise_uv, config.imperfection_m, config.imperfection_width_m, rng),
     )
-
-
-def _corner_lengths(mesh: PanelMesh) -> np.ndarray:
-    """(F, 3) length on the pattern of the side opposite each corner."""
-    a, b, c = mesh.uv.transpose(1, 0, 2)
-    return np.stack([np.linalg.norm(c - b, axis=1), np.linalg.norm(a - c, axis=1), np.linalg.norm(b - a, axis=1)], 1)
-
-
-def _rest_lengths(mesh: PanelMesh) -> tuple[np.ndarray, np.ndarray]:
-    """Unique edges, and their length on the pattern; an edge on a seam takes the mean of its two sides."""
-    edges = unique_edges(mesh.faces)
-    slot = edges_of_faces(mesh.faces, edges)[:, [1, 2, 0]].ravel()  # the side opposite each corner
-    lengths = _corner_lengths(mesh).ravel()
-    return edges, np.bincount(slot, lengths, len(edges)) / np.bincount(slot, minlength=len(edges))
-
-
-def _hinges(mesh: PanelMesh) -> tuple[np.ndarray, np.ndarray]:
-    """Bending stencils of the inner edges from the pattern's angles; seams bend like the cloth around them."""
-    lengths = _corner_lengths(mesh)
-    squared = lengths**2
-    heron = (
-        4
-        * np.linalg.norm(
-            np.cross(
-                np.pad(mesh.uv[:, 1] - mesh.uv[:, 0], ((0, 0), (0, 1))),
-                np.pad(mesh.uv[:, 2] - mesh.uv[:, 0], ((0, 0), (0, 1))),
-            ),
-            axis=1,
-        )
-        / 2
-    )
-    cotangents = (squared[:, [1, 2, 0]] + squared[:, [2, 0, 1]] - squared) / heron[:, None]  # at each corner
-
-    corners = np.array([[0, 1, 2], [1, 2, 0], [2, 0, 1]])  # edge start, edge end, opposite corner
-    start = mesh.faces[:, corners[:, 0]].ravel().astype(np.int64)
-    end = mesh.faces[:, corners[:, 1]].ravel().astype(np.int64)
-    opposite = mesh.faces[:, corners[:, 2]].ravel()
-    at_start, at_end = cotangents[:, corners[:, 0]].ravel(), cotangents[:, corners[:, 1]].ravel()
-    keys = np.minimum(start, end) * mesh.vertex_count + np.maximum(start, end)
-    order = np.argsort(keys, kind="stable")
-    paired = np.flatnonzero(keys[order][1:] == keys[order][:-1])
-    first, second = order[paired], order[paired + 1]
-    hinges = np.stack([start[first], end[first], opposite[first], opposite[second]], axis=1)
-    # The neighbour runs through the edge the other way: its start is our end.
-    same_way = start[first] == start[second]
-    c_start = np.where(same_way, at_start[second], at_end[second])
-    c_end = np.where(same_way, at_end[second], at_start[second])
-    weights = np.stack(
-        [
-            at_end[first] + c_end,
-            at_start[first] + c_start,
-            -at_start[first] - at_end[first],
-            -c_start - c_end,
-        ],
-        axis=1,
-    )
-    return hinges, np.column_stack([weights, 1 / (weights**2).sum(axis=1)])
 
 
 def lift(mesh: WrinkleMesh, coarse: np.ndarray, smoothing: float = 0.6) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""`capture4d demo`, `synth`, `scan` and `synth-board`: captures that nobody filmed."""
+"""`capture4d demo`, `synth`, `scan`, `synth-board` and `synth-drapes`: captures and drapes that nobody filmed."""
 
 from __future__ import annotations
 
@@ -9,13 +9,16 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from capture4d.cli.exit_codes import GOOD
+from capture4d.cli.exit_codes import BAD_RESULT, GOOD
 from capture4d.cli.options import MeshOptions, StageOptions
+from capture4d.cli.verdict import say_flagged
 from capture4d.errors import InputError
+from capture4d.settings import Percent
 from data_synth import config as synth_config
+from data_synth.drapes.config import DrapesConfig
 from data_synth.scanner.config import ScanConfig
 
-__all__ = ["Demo", "Scan", "Synth", "SynthBoard"]
+__all__ = ["Demo", "Scan", "Synth", "SynthBoard", "SynthDrapes"]
 
 
 BOARD_POSES = 16
@@ -105,6 +108,28 @@ class SynthBoard(StageOptions):
         pipeline.synth_board(self.rig, self.images, self.config, workers=self.workers, overwrite=self.overwrite)
         print(f"board images: {self.images}")
         return GOOD
+
+
+@dataclass(frozen=True, kw_only=True)
+class SynthDrapes(StageOptions):
+    """Drape a garment cut from a sewing pattern over a still body in many poses: a set to learn from."""
+
+    output: Annotated[Positional[Path], arg(metavar="OUTPUT")]
+    """Folder to write."""
+    max_pruned: Percent = 50.0
+    """Percent of drapes that may be unfit to learn from; more of them end in exit code 3."""
+    config: Annotated[DrapesConfig, arg(name="")] = field(default_factory=DrapesConfig)
+
+    def __call__(self) -> int:
+        from capture4d import pipeline
+
+        result = pipeline.synth_drapes(self.output, self.config, workers=self.workers, overwrite=self.overwrite)
+        kept = result.frames - len(result.failed)
+        print(f"drapes: {result.path}, {kept} of {result.frames} fit to learn from")
+        broken = result.failed_percent > self.max_pruned
+        limit = f", more than the {self.max_pruned:g} % allowed" if broken else ""
+        say_flagged(f"{len(result.failed)} drapes pruned ({result.failed_percent:.3g} %{limit})", result.failed)
+        return BAD_RESULT if broken else GOOD
 
 
 @dataclass(frozen=True, kw_only=True)

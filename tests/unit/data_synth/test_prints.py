@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from capture4d.colours.spaces import colour_angles
-from data_synth.cloth.patterns import mesh_pattern, tshirt_pattern
+from data_synth.cloth.patterns import mesh_pattern
+from data_synth.cloth.tshirt import tshirt_pattern
 from data_synth.config import PRESETS, GarmentStyle
 from data_synth.outfits import OUTFITS, PrintName
 from data_synth.prints import draw_print, logo_circle, picture_over, printed_cloth

@@ -7,7 +7,8 @@ import pytest
 
 from capture4d.body.skinning import ShapedBody
 from capture4d.geometry.mesh import boundary_edges, unique_edges
-from data_synth.cloth.patterns import grade, locate, mesh_pattern, tshirt_pattern
+from data_synth.cloth.patterns import grade, locate, mesh_pattern
+from data_synth.cloth.tshirt import tshirt_pattern
 from data_synth.config import GarmentStyle
 
 

@@ -8,7 +8,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from data_synth.cloth.patterns import Edge, Panel, PanelMesh, Pattern, mesh_pattern
+from data_synth.cloth.panels import Edge, Panel, Pattern
+from data_synth.cloth.patterns import PanelMesh, mesh_pattern
 from data_synth.cloth.quality import measure_cloth
 from data_synth.cloth.wrinkle_relaxation import WrinkleMesh, lift, relax_frame, wrinkle_mesh
 from data_synth.config import Fabric, RelaxationConfig

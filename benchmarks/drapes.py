@@ -1,0 +1,156 @@
+"""Static drapes: what one costs, how many are fit to learn from, and how much a drape is a function of its pose.
+
+Limits this benchmark was built against, at 3,000 vertices: at most 0.4 CPU seconds a drape, at least 85 % kept by the
+area rule of Jin et al., two ways into a pose within 5 mm, a mirrored pose within 4 mm of the mirrored drape, a tenth of
+a degree in every joint within 3 mm, at most 0.05 % of the vertices inside the body, 99 % of edges within 1.15 of their
+length (1.2 with arms overhead).
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from rich.console import Console
+from scipy.spatial.transform import Rotation
+
+from benchmarks.metric import Metric
+from capture4d.body.anny import load_anny
+from capture4d.body.skinning import with_pose
+from capture4d.runs.workers import run_jobs
+from data_synth.cloth.simulation import simulate
+from data_synth.config import FABRICS, SimulationConfig
+from data_synth.drapes.config import DrapesConfig, GarmentName
+from data_synth.drapes.draping import Draper
+from data_synth.drapes.garments import GARMENTS
+from data_synth.drapes.poses import draw_pose
+from data_synth.drapes.quality import AREA_LIMITS, face_area_ratios, measure_drape
+
+WAY_FRAMES, MOST_REST_FRAMES = 15, 60
+"""In which the moving simulator takes a shirt to a pose, and then lets it rest, at most."""
+VERTICES = {"necktie": 900}
+QUICK: list[GarmentName] = ["trousers", "necktie"]
+
+
+def run(
+    *,
+    quick: bool = False,
+    poses: int = 60,
+    pairs: int = 10,
+    garment: GarmentName | None = None,
+    simulator: bool = True,
+    seed: int = 0,
+) -> list[Metric]:
+    """Drape every kind of garment in random poses.
+
+    Args:
+        quick: trousers and necktie alone, which no simulation has to put on, a third of the vertices, 4 poses and 2
+            pairs.
+        poses: of each garment.
+        pairs: of drapes that are compared with each other: two ways, mirror images, a tenth of a degree.
+        garment: that one alone.
+        simulator: take a T-shirt to a pose with the moving simulator as well, half a CPU minute.
+    """
+    names = QUICK if quick else list(GARMENTS)
+    names = names if garment is None else [garment]
+    counts = (4, 2) if quick else (poses, pairs)
+    configs = [
+        DrapesConfig(
+            garment=name, vertices=VERTICES.get(name, 3000) // (3 if quick else 1), seed=seed, samples=counts[0]
+        )
+        for name in names
+    ]
+    metrics: list[Metric] = []
+    for config, row in run_jobs(
+        partial(_measure, pairs=counts[1], simulator=simulator), configs, workers=1, label="Drapes"
+    ):
+        told = ", ".join(f"{key} {value:.4g}" for key, (value, _) in row.items())
+        Console(stderr=True).print(f"{config.garment}: {told}", soft_wrap=True)
+        for key, (value, unit) in row.items():
+            better = "higher" if key in ("kept_percent", "area_kept_percent", "ratio_to_simulator") else "lower"
+            metrics.append(Metric(f"{config.garment}_{key}", value, unit, better))
+    return metrics
+
+
+def _measure(config: DrapesConfig, *, pairs: int, simulator: bool) -> tuple[DrapesConfig, dict[str, tuple[float, str]]]:
+    started = time.process_time()
+    draper = Draper(config, load_anny())
+    ready = time.process_time() - started
+    limbs, person = GARMENTS[config.garment].limbs, draper.person
+    poses = [
+        draw_pose(person, limbs, config.poses, np.random.default_rng([config.seed, 0, number]))[0]
+        for number in range(config.samples)
+    ]
+    draper.drape(poses[0])  # kernels are compiled
+    drapes, costs, quality = [], [], []
+    for pose in poses:
+        started = time.process_time()
+        drapes.append(draper.drape(pose))
+        costs.append(time.process_time() - started)
+        quality.append(measure_drape(draper, pose, drapes[-1]))
+    areas = [face_area_ratios(draper, drape.vertices) for drape in drapes]
+    low, high = AREA_LIMITS
+    row = {
+        "put_on_cpu_s": (ready, "s"),
+        "drape_cpu_s": (float(np.mean(costs)), "s"),
+        "frames": (float(np.mean([drape.frames for drape in drapes])), ""),
+        "area_kept_percent": (100 * float(np.mean([low <= each.min() and each.max() <= high for each in areas])), "%"),
+        "kept_percent": (100 * float(np.mean([not each.reasons for each in quality])), "%"),
+        "inside_body_percent": (float(np.mean([each.inside_percent for each in quality])), "%"),
+        "stretch_p99": (float(np.median([each.stretch_p99 for each in quality])), ""),
+        "stretch_p99_worst": (float(np.percentile([each.stretch_p99 for each in quality], 95)), ""),
+        "cut_percent": (float(np.median([each.cut_percent for each in quality])), "%"),
+    }
+    turned = np.random.default_rng([config.seed, 2])
+    apart: dict[str, list[float]] = {"two_ways_mm": [], "mirrored_mm": [], "tenth_degree_mm": []}
+    for number in range(min(pairs, len(poses) - 1)):
+        pose, drape, other = poses[number], drapes[number].vertices, drapes[number + 1].vertices
+        second = draper.drape(pose, start=(other, poses[number + 1])).vertices
+        apart["two_ways_mm"].append(_apart_mm(drape, second))
+        assert draper.mesh.mirror is not None
+        image = draper.drape(_mirrored_pose(pose, person.body.joint_names)).vertices
+        apart["mirrored_mm"].append(_apart_mm(drape, image[draper.mesh.mirror] * (-1.0, 1.0, 1.0)))
+        axes = turned.standard_normal((len(pose), 3))
+        axes *= np.radians(0.1) / np.linalg.norm(axes, axis=1, keepdims=True)
+        moved = np.abs(pose - np.eye(3)).max(axis=(1, 2)) > 1e-9
+        near = np.where(moved[:, None, None], Rotation.from_rotvec(axes).as_matrix() @ pose, pose)
+        apart["tenth_degree_mm"].append(_apart_mm(drape, draper.drape(near).vertices))
+    row |= {key: (float(np.mean(values)), "mm") for key, values in apart.items()}
+    if simulator and config.garment == "tshirt":
+        row["ratio_to_simulator"] = (_simulator_cpu_s(draper, poses[0]) / row["drape_cpu_s"][0], "")
+    return config, row
+
+
+def _apart_mm(first: np.ndarray, second: np.ndarray) -> float:
+    return 1e3 * float(np.linalg.norm(first - second, axis=1).mean())
+
+
+def _mirrored_pose(rotations: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
+    """The pose of the mirror image."""
+    flip = np.diag([-1.0, 1.0, 1.0])
+    swap = {".L": ".R", ".R": ".L"}
+    other = [names.index(name[:-2] + swap.get(name[-2:], name[-2:])) for name in names]
+    return flip @ rotations[other] @ flip
+
+
+def _simulator_cpu_s(draper: Draper, pose: np.ndarray) -> float:
+    """CPU seconds of the moving simulator on its way from the dressing pose, until the cloth moves as little."""
+    turns = Rotation.from_matrix(np.einsum("jba,jbc->jac", draper.dressing, pose)).as_rotvec()
+    way = [
+        np.einsum("jab,jbc->jac", draper.dressing, Rotation.from_rotvec(turns * share).as_matrix())
+        for share in np.linspace(0, 1, WAY_FRAMES)
+    ]
+    bodies = [with_pose(draper.person, each, np.zeros(3)) for each in way]
+    bodies = [bodies[0], bodies[0], *bodies, *[bodies[-1]] * MOST_REST_FRAMES]
+    config = replace(SimulationConfig(), vertices=draper.mesh.vertex_count, calm_frames=1, hold_hz=10.0)
+    frames = simulate(draper.mesh, draper.dressed, bodies, FABRICS["jersey"], config)
+    before = next(frames)
+    started = time.process_time()
+    for number, cloth in enumerate(frames):
+        still = _apart_mm(before, cloth) < draper.config.solver.still_mm
+        before = cloth
+        if number > WAY_FRAMES + 2 and still:
+            break
+    return time.process_time() - started

@@ -1,0 +1,1 @@
+"""Garments of several kinds draped on still bodies, one pose at a time."""

@@ -1,0 +1,93 @@
+"""The small-step solver against what is known of hanging, sliding and bent sheets."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from data_synth.cloth.panels import Edge, Panel, Pattern, line
+from data_synth.cloth.patterns import PanelMesh, mesh_pattern
+from data_synth.drapes.config import Cloth
+from data_synth.drapes.solver import FRAME_SUBSTEPS, Planes, Sheet, advance
+
+CLOTH = Cloth()
+NOTHING = Planes(np.zeros(0, np.int32), np.zeros((0, 3)), np.zeros((0, 3)))
+
+
+def strip(width: float = 0.1, height: float = 0.3, vertices: int = 200) -> PanelMesh:
+    """A rectangle whose upper edge is at v = 0."""
+    left, right = -width / 2, width / 2
+    corners = [(left, -height), (right, -height), (right, 0.0), (left, 0.0)]
+    edges = tuple(
+        Edge(line(a, b), f"outline|{i}")
+        for i, (a, b) in enumerate(zip(corners, corners[1:] + corners[:1], strict=True))
+    )
+    pattern = Pattern((Panel("front", edges),), borders=("outline",))
+    return mesh_pattern(pattern, vertices, np.random.default_rng(0), symmetric=True)
+
+
+def run(sheet: Sheet, points: np.ndarray, planes: Planes, frames: int, keep: float = 0.97) -> np.ndarray:
+    points, velocities = points.copy(), np.zeros_like(points)
+    hold = np.zeros_like(points), np.zeros(len(points))
+    for _ in range(frames):
+        advance(sheet, points, velocities, hold, planes, margin=0.0, keep=keep, substeps=FRAME_SUBSTEPS)
+    return points
+
+
+def flat(mesh: PanelMesh) -> np.ndarray:
+    return np.column_stack([mesh.vertex_uv, np.zeros(mesh.vertex_count)])
+
+
+def test_a_pinned_strip_hangs_straight_and_hardly_longer():
+    mesh = strip()
+    start = flat(mesh)
+    top = np.flatnonzero(start[:, 1] > -1e-9)
+    end = run(Sheet.create(mesh, CLOTH, top), start, NOTHING, frames=60)
+    np.testing.assert_array_equal(end[top], start[top])
+    stretch = np.ptp(end[:, 1]) / np.ptp(start[:, 1])
+    assert 1.0 < stretch < 1.015
+
+
+def test_the_mirror_image_of_a_start_gives_the_mirror_image():
+    mesh, flip = strip(), np.array([-1.0, 1.0, 1.0])
+    assert mesh.mirror is not None
+    top = np.flatnonzero(flat(mesh)[:, 1] > -1e-9)
+    sheet = Sheet.create(mesh, CLOTH, top)
+    start = flat(mesh) + np.random.default_rng(1).normal(scale=1e-3, size=(mesh.vertex_count, 3))
+    start[top] = flat(mesh)[top]
+    end = run(sheet, start, NOTHING, frames=20)
+    image = run(sheet, (start * flip)[mesh.mirror], NOTHING, frames=20)
+    moved = np.linalg.norm(end - start, axis=1).mean()
+    assert np.linalg.norm(image[mesh.mirror] * flip - end, axis=1).mean() < 0.2 * moved
+
+
+@pytest.mark.parametrize(("friction", "slides"), [(0.1, True), (0.8, False)])
+def test_cloth_slides_down_a_slope_that_is_steeper_than_its_friction(friction: float, slides: bool):
+    mesh = strip(height=0.1, vertices=80)
+    slope = np.radians(20)  # tangent .36
+    normal = np.array([0.0, np.cos(slope), np.sin(slope)])
+    downhill = np.array([0.0, -np.sin(slope), np.cos(slope)])
+    start = mesh.vertex_uv[:, :1] * (1.0, 0.0, 0.0) - mesh.vertex_uv[:, 1:] * downhill
+    planes = Planes(
+        np.arange(mesh.vertex_count, dtype=np.int32),
+        np.zeros((mesh.vertex_count, 3)),
+        np.tile(normal, (mesh.vertex_count, 1)),
+    )
+    sheet = Sheet.create(mesh, Cloth(friction=friction), np.zeros(0, int))
+    moved = (run(sheet, start, planes, frames=12, keep=1.0) - start) @ downhill
+    if slides:  # g (sin - f cos) t^2 / 2
+        assert moved.mean() == pytest.approx(0.5 * 9.81 * (np.sin(slope) - friction * np.cos(slope)) * 0.2**2, rel=0.1)
+    else:
+        assert np.abs(moved).max() < 2e-3
+
+
+def test_stiffer_cloth_bends_less():
+    mesh = strip(width=0.06, height=0.15)
+    start = np.column_stack([mesh.vertex_uv[:, 0], np.zeros(mesh.vertex_count), -mesh.vertex_uv[:, 1]])
+    clamped = np.flatnonzero(mesh.vertex_uv[:, 1] > mesh.vertex_uv[:, 1].max() - 0.015)
+    reach = [
+        run(Sheet.create(mesh, Cloth(bending=bending), clamped), start, NOTHING, frames=60, keep=0.985)[:, 2].max()
+        for bending in (1e-5, 1e-4, 1e-3)
+    ]
+    assert 1.3 * reach[0] < reach[1]
+    assert 1.3 * reach[1] < reach[2]
