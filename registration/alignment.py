@@ -22,8 +22,8 @@ SAMPLES = 2000
 TRIM = 0.85
 """Share of the closest pairs that count: the scan may show more or less than the template."""
 AS_NEAR = 1.1
-"""Of two results whose distances differ by less than this factor the one that turns less counts: a shirt that was turned
-back to front lies as near to a moving one as the shirt itself."""
+"""Of two results whose distances differ by less than this factor the one that turns less counts: a shirt turned back to
+front lies as near to a moving one as the shirt itself."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
