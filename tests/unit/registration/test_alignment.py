@@ -53,9 +53,10 @@ def test_an_aligned_pair_stays(tube: Callable[[int, int], Mesh]) -> None:
 def test_what_turns_less_counts_where_both_lie_as_near() -> None:
     angle, height = (grid.ravel() for grid in np.meshgrid(np.linspace(0, 2 * np.pi, 60), np.linspace(0, 0.7, 30)))
     tube = np.stack([0.25 * np.cos(angle), height, 0.12 * np.sin(angle)], axis=1)
-    dent = 0.004 * np.clip(np.sin(angle), 0, 1)[:, None] * np.array([0, 0, 1.0])
-    behind = 0.004 * np.clip(-np.sin(angle), 0, 1)[:, None] * np.array([0, 0, -1.0])  # turned by 180 degrees it fits
+    dent = 0.003 * np.clip(np.sin(angle), 0, 1)[:, None] * np.array([0, 0, 1.0])
+    behind = 0.003 * np.clip(-np.sin(angle), 0, 1)[:, None] * np.array([0, 0, -1.0])  # turned by 180 degrees it fits
+    folds = 0.015 * np.sin(9 * angle + 20 * height)[:, None] * (tube * [1, 0, 1]) / 0.2
 
-    moved = align(tube + dent, tube + behind + np.array([0.2, 0.3, 0.0]), with_scale=False)
+    moved = align(tube + dent, tube + behind + folds + np.array([0.2, 0.3, 0.0]), with_scale=False)
 
     assert np.trace(moved.rotation) > 2.9
