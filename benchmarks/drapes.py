@@ -53,7 +53,7 @@ def run(
         garment: that one alone.
         simulator: take a T-shirt to a pose with the moving simulator as well, half a CPU minute.
     """
-    names = QUICK if quick else list(GARMENTS)
+    names: list[GarmentName] = QUICK if quick else list(GARMENTS)
     names = names if garment is None else [garment]
     counts = (4, 2) if quick else (poses, pairs)
     configs = [

@@ -98,7 +98,7 @@ def _in_order(boundary: np.ndarray, points: np.ndarray, faces: np.ndarray) -> tu
     inner = points[distance > COINCIDE_M]
     kept = inner[_first_of_each(inner)]
     everything = np.concatenate([boundary, kept])
-    return everything, KDTree(everything).query(points)[1][faces]
+    return everything, np.asarray(KDTree(everything).query(points)[1])[faces]
 
 
 def _first_of_each(points: np.ndarray) -> np.ndarray:

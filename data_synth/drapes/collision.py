@@ -51,7 +51,7 @@ class BodyParts:
     def create(person: ShapedBody, masks: np.ndarray) -> BodyParts:
         """Args: masks: (P, B) bool, which vertices of the body belong to each part."""
         all_faces = person.body.template.faces
-        part_faces = masks[:, all_faces].all(axis=2)
+        part_faces = np.asarray(masks[:, all_faces].all(axis=2))
         kept = part_faces.any(axis=0)
         used, corners = np.unique(all_faces[kept], return_inverse=True)
         faces = np.ascontiguousarray(corners.reshape(-1, 3), np.int32)

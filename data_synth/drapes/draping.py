@@ -284,7 +284,7 @@ def symmetric_person(person: ShapedBody) -> ShapedBody:
     A body whose mesh is not symmetric is returned as it is.
     """
     template, flip = person.body.template.vertices, np.array([-1.0, 1.0, 1.0])
-    distance, image = KDTree(template).query(template * flip)
+    distance, image = map(np.asarray, KDTree(template).query(template * flip))
     joints = _other_side(person.body.joint_names)
     if distance.max() > 1e-3 or len(np.unique(image)) < len(image):
         return person
@@ -310,7 +310,7 @@ def _contacts(mesh: PanelMesh, panels: np.ndarray, kind: Garment) -> tuple[np.nd
     for face_panel in np.unique(mesh.face_panels):
         corners = mesh.faces[mesh.face_panels == face_panel].ravel()
         name = panels[np.flatnonzero(mesh.face_panels[mesh.vertex_faces] == face_panel)[0]]
-        meets[np.ix_(np.unique(corners), kind.meets[name])] = True
+        meets[np.unique(corners)[:, None], list(kind.meets[str(name)])] = True
     adjacency = vertex_adjacency(mesh.faces, mesh.vertex_count)
     seam = meets.sum(axis=1) > 1  # sewn between panels that meet different parts
     near = seam
