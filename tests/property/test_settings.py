@@ -22,12 +22,17 @@ from hypothesis import strategies as st
 from capture4d.cli.main import COMMANDS
 from capture4d.settings import Condition, PowerOfTwo, Range, SettingError
 from data_synth.config import TRAINING_SETS, TrainingSetConfig
+from data_synth.drapes.config import HOLDS, Hold
 from registration.config import DenseConfig, Schedule
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("capture4d", "data_synth", "registration", "retarget", "wrinkles")
 NAMED_SO = re.compile(r"(Config|Settings|Schedule)$")
-EXAMPLES: dict[type, Any] = {Schedule: DenseConfig().cold, TrainingSetConfig: TRAINING_SETS["tiny-train"]}
+EXAMPLES: dict[type, Any] = {
+    Hold: HOLDS["tshirt"],
+    Schedule: DenseConfig().cold,
+    TrainingSetConfig: TRAINING_SETS["tiny-train"],
+}
 """Of the classes that cannot be made without arguments."""
 
 
