@@ -136,7 +136,7 @@ def tracked_body(body: Body, *, samples: int = SURFACE_SAMPLES) -> TrackedBody:
 
 def _groups(body: Body) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The groups of the faces, and their joints."""
-    moves = np.any((body.skin_weights > 0)[body.template.faces], axis=1, keepdims=False)
+    moves = np.asarray((body.skin_weights > 0)[body.template.faces].any(axis=1))
     for joint in range(len(body.parents) - 1, 0, -1):  # parents come before their children
         moves[:, body.parents[joint]] |= moves[:, joint]
     bits = np.packbits(moves, axis=1)  # rows of bytes sort fifty times faster than rows of numbers
