@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from capture4d.app.compare.config import CompareConfig
+from capture4d.app.export.export import export
 from capture4d.app.status.work_folders import changes, diff, made_anew, needs_tracking, status
 from capture4d.app.status.work_folders import plan as plan
 from capture4d.calibration.config import CalibrationConfig, RigCheckConfig
@@ -41,8 +42,8 @@ if TYPE_CHECKING:
     from retarget.animation.stage import Wearer
 
 __all__ = [
-    "animate", "calibrate", "check", "check_rig", "compare", "diff", "extract", "fit", "register", "register_mesh",
-    "report", "run", "scan", "status", "synth", "synth_board", "synth_drapes", "template", "track",
+    "animate", "calibrate", "check", "check_rig", "compare", "diff", "export", "extract", "fit", "register",
+    "register_mesh", "report", "run", "scan", "status", "synth", "synth_board", "synth_drapes", "template", "track",
     "wrinkles_apply", "wrinkles_maps", "wrinkles_offsets", "wrinkles_train",
 ]  # fmt: skip
 

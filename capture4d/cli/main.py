@@ -20,6 +20,7 @@ from typing import Any, NoReturn
 from capture4d.cli.answers import TerminatedError, answer_to, complain
 from capture4d.cli.commands.capture import Calibrate, Check, CheckRig
 from capture4d.cli.commands.doctor import Doctor
+from capture4d.cli.commands.exchange import Export
 from capture4d.cli.commands.files import ConvertBody, ConvertPoses, ConvertRig, RegisterMesh, Template
 from capture4d.cli.commands.folders import Diff, Status
 from capture4d.cli.commands.models import Animate, Fit
@@ -62,6 +63,7 @@ COMMANDS: Mapping[str, Any] = {
     "wrinkles apply": WrinklesApply,
     "wrinkles offsets": WrinklesOffsets,
     "compare": Compare,
+    "export": Export,
     "register-mesh": RegisterMesh,
     "calibrate": Calibrate,
     "check-rig": CheckRig,

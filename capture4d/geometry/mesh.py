@@ -14,6 +14,7 @@ from scipy.sparse import csgraph
 from capture4d.types import Mesh
 
 __all__ = [
+    "angle_weighted_normals",
     "boundary_edges",
     "boundary_loops",
     "connected_components",
@@ -59,6 +60,22 @@ def vertex_normals(vertices: Float[np.ndarray, "V 3"], faces: Integer[np.ndarray
     total = np.empty_like(vertices)
     for axis in range(3):
         total[:, axis] = np.bincount(corners, np.repeat(weighted[:, axis], 3), minlength=len(vertices))
+    return normalised(total)
+
+
+def angle_weighted_normals(
+    vertices: Float[np.ndarray, "V 3"], faces: Integer[np.ndarray, "F 3"]
+) -> Float[np.ndarray, "V 3"]:
+    """Unit normals, averaged over the faces around a vertex by their angles there, as Blender does; zero where there is
+    no face with area."""
+    corners = vertices[faces]
+    flat = normalised(doubled_area_vectors(vertices, faces))
+    total = np.zeros_like(vertices)
+    for corner in range(3):
+        along, across = (corners[:, (corner + step) % 3] - corners[:, corner] for step in (1, 2))
+        angle = np.arctan2(np.linalg.norm(np.cross(along, across), axis=1), np.einsum("fx,fx->f", along, across))
+        for axis in range(3):
+            total[:, axis] += np.bincount(faces[:, corner], angle * flat[:, axis], minlength=len(vertices))
     return normalised(total)
 
 

@@ -1,0 +1,1 @@
+"""Registered and animated garments on their way out to other tools."""

@@ -1,0 +1,40 @@
+"""Settings of the export. Standard library alone: `capture4d --help` loads it."""
+
+from __future__ import annotations
+
+from dataclasses import field
+from typing import Annotated, Literal, get_args
+
+from capture4d.settings import Positive, Range, settings
+
+__all__ = ["FORMATS", "ExportConfig", "Format", "GlbConfig"]
+
+Format = Literal["usd", "abc", "glb", "pc2", "mdd", "obj", "ply"]
+FORMATS: tuple[Format, ...] = get_args(Format)
+
+
+@settings
+class GlbConfig:
+    """How a GLB, which knows neither caches nor frames, is made to move."""
+
+    motion: Literal["skinned", "exact"] = "skinned"
+    """`skinned`: the skeleton moves it, and few shapes correct it, within the errors below. `exact`: a shape for each
+    frame, for clips of up to a hundred frames or so."""
+    p99_mm: Positive = 0.5
+    """Error that 99 of 100 vertices keep, over all frames, ..."""
+    max_mm: Positive = 2.0
+    """... and the largest that any has."""
+    most: Annotated[int, Range(least=1, most=400)] = 128
+    """Correcting shapes at most, whatever is left of the error, which is told."""
+
+
+@settings
+class ExportConfig:
+    """What is written beside positions, and how."""
+
+    maps: Literal["8", "16", "none"] = "8"
+    """Bits of the normal maps of WORK/wrinkles/generated that go along, if there are any."""
+    normals: bool = True
+    """Author each frame's vertex normals in USD and Alembic: every client shades alike, Blender shows a frame in three
+    times the time."""
+    glb: GlbConfig = field(default_factory=GlbConfig)

@@ -1,0 +1,40 @@
+"""What `capture4d export` does, for Python: the pipeline hands it on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from capture4d.app.export.config import ExportConfig, Format
+from capture4d.captures.work_folder import AnyWork, Place, opened_work
+from capture4d.runs.run_log import logged_stage
+
+if TYPE_CHECKING:
+    from capture4d.app.export.stage import Exported
+
+__all__ = ["export"]
+
+
+@logged_stage("export")
+def export(
+    work: AnyWork,
+    formats: Sequence[Format],
+    output: Place | None = None,
+    config: ExportConfig | None = None,
+    *,
+    frames: str = "",
+    overwrite: bool = False,
+) -> Exported:
+    """Hand a registered or animated garment on to other tools: a file for each format, each read back.
+
+    Args:
+        formats: of "usd", "abc", "glb", "pc2", "mdd", "obj", "ply".
+        output: folder to write; WORK/exports if None.
+        frames: only these, such as "1-200:5".
+    """
+    from capture4d.app.export.stage import run as stage
+
+    opened = opened_work(work)
+    folder = opened.path / "exports" if output is None else Path(output)
+    return stage(opened, folder, formats, config or ExportConfig(), frames=frames, overwrite=overwrite)
