@@ -63,9 +63,13 @@ def motion(frames: int, *, seed: int, fps: float, first: int, step: int = 1) -> 
 
 
 def folds(mesh: Mesh, frames: int, seed: int, waves: int = 5) -> np.ndarray:
-    """(T, V, 3) float64: what a garment does over its skeleton, metres."""
+    """(T, V, 3) float64: what a garment does over its skeleton, metres: waves around and along it, outwards."""
     rng = np.random.default_rng(seed + 100)
-    directions = rng.standard_normal((waves, len(mesh.vertices), 3))
+    around, height = np.arctan2(mesh.vertices[:, 0], mesh.vertices[:, 2]), mesh.vertices[:, 1] / 0.5
+    turns, rises, phases = rng.integers(1, 5, waves), rng.uniform(0, 3, waves), rng.uniform(0, 6, waves)
+    outwards = np.stack([np.sin(around), np.zeros_like(around), np.cos(around)], axis=1)
+    waving = np.cos(np.outer(turns, around) + 2 * np.pi * np.outer(rises, height) + phases[:, None])
+    directions = waving[..., None] * outwards
     return 0.004 * np.einsum("tk,kvc->tvc", rng.standard_normal((frames, waves)).cumsum(axis=0) / 3, directions)
 
 
