@@ -1,0 +1,87 @@
+"""Exports opened in real clients: Blender, three.js in Chromium, Khronos' validator. Skipped where these are absent.
+
+    CAPTURE4D_BLENDER=/path/to/python-with-bpy NODE_MODULES=/path/to/node_modules pytest tests/judges -m slow
+"""
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from capture4d.cli.exit_codes import GOOD
+from capture4d.files.atomic import read_json
+from tests.command_line import run
+from tests.moving_garment import write_moving_work
+
+HERE = Path(__file__).parent
+BLENDER, MODULES = os.environ.get("CAPTURE4D_BLENDER"), os.environ.get("NODE_MODULES")
+CHROMIUM = os.environ.get("CHROMIUM", "/usr/bin/chromium")
+CANNOT_READ = 2
+
+pytestmark = pytest.mark.slow
+needs_blender = pytest.mark.skipif(
+    BLENDER is None, reason="CAPTURE4D_BLENDER names no Python with bpy: Blender is not asked"
+)
+needs_browser = pytest.mark.skipif(
+    MODULES is None or shutil.which("node") is None or not Path(CHROMIUM).exists(),
+    reason="NODE_MODULES names no three, gltf-validator and playwright-core, or there is no Chromium: it is not asked",
+)
+
+
+@pytest.fixture(scope="module", params=[(25.0, 1), (59.94, 4801)], ids=["25fps", "59.94fps"])
+def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, float, int]:
+    fps, first = request.param
+    folder = tmp_path_factory.mktemp("judged")
+    vertices = write_moving_work(folder / "work", 36, seed=first, fps=fps, first=first, maps=8)
+    np.save(folder / "vertices.npy", vertices)
+    assert run("export", folder / "work", "--all", "--quiet") == GOOD
+    return folder, fps, first
+
+
+def judged(*arguments: object) -> None:
+    done = subprocess.run([str(each) for each in arguments], capture_output=True, text=True, check=False)
+    if done.returncode == CANNOT_READ:
+        pytest.skip(done.stdout.strip().splitlines()[-1])
+    assert done.returncode == 0, "\n".join(line for line in done.stdout.splitlines() if "MISMATCH" in line) or done.stderr
+
+
+@needs_blender
+@pytest.mark.parametrize("kind", ["usdc", "abc", "pc2", "mdd", "glb"])
+def test_blender_shows_what_was_exported(kind: str, exported: tuple[Path, float, int]):
+    folder, fps, first = exported
+    exports = folder / "work" / "exports"
+    file, tolerance, more = exports / f"garment.{kind}", 0.001, []
+    if not file.is_file():
+        pytest.skip(f"no {kind}: its package is not installed")
+    match kind:
+        case "usdc":
+            more = ["--normals-p99-deg", 0.1, "--normal-map", "static"]
+            more += ["--normal-file", exports / "normals" / f"{first:06d}.png"]
+        case "abc":
+            more = ["--normals-p99-deg", 0.1]
+        case "glb":
+            if fps != int(fps):
+                pytest.skip("Blender takes the rate of a GLB for a whole number")
+            first, more = 0, ["--normal-map", "static"]
+            tolerance = read_json(exports / "export.json")["files"]["glb"]["error_mm"] + 0.002
+        case _:
+            more = ["--base", exports / "garment.obj"]
+    template = folder / "work" / "registration" / "garment.npz"
+    judged(
+        BLENDER, HERE / "check_in_blender.py", file, folder / "vertices.npy", "--fps", fps, "--first-frame", first,
+        "--template", template, "--tolerance-mm", tolerance, *more,
+    )  # fmt: skip
+
+
+@needs_browser
+def test_three_js_shows_what_was_exported_and_the_validator_finds_no_error(exported: tuple[Path, float, int]):
+    folder, fps, _ = exported
+    exports = folder / "work" / "exports"
+    tolerance = read_json(exports / "export.json")["files"]["glb"]["error_mm"] + 0.002
+    judged(
+        "node", HERE / "check_in_browser.mjs", exports / "garment.glb", folder / "vertices.npy", "--fps", fps,
+        "--normal-map", "--tolerance-mm", tolerance,
+    )  # fmt: skip
