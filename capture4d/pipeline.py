@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 from capture4d.app.compare.config import CompareConfig
 from capture4d.app.export.export import export
+from capture4d.app.importing.folders import import_meshes, score
 from capture4d.app.status.work_folders import changes, diff, made_anew, needs_tracking, status
 from capture4d.app.status.work_folders import plan as plan
 from capture4d.calibration.config import CalibrationConfig, RigCheckConfig
@@ -42,8 +43,9 @@ if TYPE_CHECKING:
     from retarget.animation.stage import Wearer
 
 __all__ = [
-    "animate", "calibrate", "check", "check_rig", "compare", "diff", "export", "extract", "fit", "register",
-    "register_mesh", "report", "run", "scan", "status", "synth", "synth_board", "synth_drapes", "template", "track",
+    "animate", "calibrate", "check", "check_rig", "compare", "diff", "export", "extract", "fit", "import_meshes",
+    "register", "register_mesh", "report", "run", "scan", "score", "status", "synth", "synth_board", "synth_drapes",
+    "template", "track",
     "wrinkles_apply", "wrinkles_maps", "wrinkles_offsets", "wrinkles_train",
 ]  # fmt: skip
 

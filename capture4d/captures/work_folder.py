@@ -33,6 +33,7 @@ from capture4d.types import Body, PoseSequence, RegisteredSequence
 
 __all__ = [
     "ANIMATE",
+    "IMPORT",
     "REGISTER",
     "VERDICTS",
     "AnyCapture",
@@ -53,7 +54,7 @@ __all__ = [
 
 VERDICTS = ("good", "check", "failed")
 """What a frame's file holds as a number."""
-REGISTER, ANIMATE = "register", "animate"
+REGISTER, ANIMATE, IMPORT = "register", "animate", "import"
 """Stages that write a registered sequence."""
 
 

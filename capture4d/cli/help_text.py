@@ -25,7 +25,7 @@ _GROUPS: Mapping[str, Sequence[str]] = {
     "learn and animate:": (
         "fit", "animate", "wrinkles maps", "wrinkles train", "wrinkles apply", "wrinkles offsets", "compare",
     ),
-    "out to other tools:": ("export",),
+    "out to other tools, and back:": ("export", "import", "score"),
     "two meshes:": ("register-mesh",),
     "rigs:": ("calibrate", "check-rig", "convert-rig", "synth-board"),
     "captures that nobody filmed:": ("demo", "synth", "scan", "synth-drapes"),
@@ -69,6 +69,8 @@ EXAMPLES: Mapping[str, Sequence[str]] = {
     "wrinkles offsets": ("wrinkles offsets work",),
     "compare": ("compare work --model model",),
     "export": ("export work", "export dance --format glb --format abc --frames 1-200"),
+    "import": ("import edited.abc --template work/registration/garment.npz --output edited",),
+    "score": ("score edited capture --fail-above correspondence_mean_mm=3",),
     "register-mesh": ("register-mesh template.obj scan.ply --output fitted.ply --border-colour ffd200",),
     "calibrate": ("calibrate images --board charuco:14x10:60:44:DICT_5X5_100 --output rig.json",),
     "check-rig": ("check-rig rig.json images",),

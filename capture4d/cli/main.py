@@ -20,7 +20,7 @@ from typing import Any, NoReturn
 from capture4d.cli.answers import TerminatedError, answer_to, complain
 from capture4d.cli.commands.capture import Calibrate, Check, CheckRig
 from capture4d.cli.commands.doctor import Doctor
-from capture4d.cli.commands.exchange import Export
+from capture4d.cli.commands.exchange import Export, Import, Score
 from capture4d.cli.commands.files import ConvertBody, ConvertPoses, ConvertRig, RegisterMesh, Template
 from capture4d.cli.commands.folders import Diff, Status
 from capture4d.cli.commands.models import Animate, Fit
@@ -64,6 +64,8 @@ COMMANDS: Mapping[str, Any] = {
     "wrinkles offsets": WrinklesOffsets,
     "compare": Compare,
     "export": Export,
+    "import": Import,
+    "score": Score,
     "register-mesh": RegisterMesh,
     "calibrate": Calibrate,
     "check-rig": CheckRig,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -14,7 +14,7 @@ from capture4d.app.report.metrics import METRICS
 from capture4d.errors import InputError
 from capture4d.files.atomic import read_json
 
-__all__ = ["KNOWN_METRICS", "Limit", "broken_limits", "parse_limits", "parse_numbers", "unknown_metric"]
+__all__ = ["KNOWN_METRICS", "Limit", "broken_among", "broken_limits", "parse_limits", "parse_numbers", "unknown_metric"]
 
 KNOWN_METRICS = tuple(dict.fromkeys((*METRICS, *ANIMATION_METRICS)))
 """Of reports of takes and of animated garments."""
@@ -100,10 +100,19 @@ def broken_limits(work: Path, limits: Sequence[Limit]) -> list[str]:
     """
     path = work / "report" / "metrics.json"
     metrics = {entry["key"]: entry["value"] for entry in read_json(path)["metrics"]} if limits else {}
+    return broken_among(metrics, limits, where=path)
+
+
+def broken_among(metrics: Mapping[str, float | None], limits: Sequence[Limit], *, where: Path) -> list[str]:
+    """The same of metrics that are known.
+
+    Args:
+        where: the file that holds them.
+    """
     broken = []
     for limit in limits:
         if limit.metric not in metrics:
-            raise unknown_metric(limit.option, limit.metric, metrics, where=f" in {path}")
+            raise unknown_metric(limit.option, limit.metric, metrics, where=f" in {where}")
         value = metrics[limit.metric]
         if limit.broken_by(value):
             broken.append(_said(limit, value))

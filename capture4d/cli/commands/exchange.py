@@ -1,4 +1,4 @@
-"""`capture4d export`: a garment out to other tools."""
+"""`capture4d export`, `import` and `score`: a garment out to other tools, and back."""
 
 from __future__ import annotations
 
@@ -10,15 +10,26 @@ from typing import Annotated
 from tyro.conf import Positional, UseAppendAction, arg
 
 from capture4d.app.export.config import FORMATS, ExportConfig, Format
+from capture4d.app.importing.config import ImportConfig
 from capture4d.cli.exit_codes import BAD_RESULT, GOOD
-from capture4d.cli.options import ProgressOptions
+from capture4d.cli.options import MeshOptions, ProgressOptions, StageOptions
 from capture4d.errors import CommandLineError
 
-__all__ = ["Export"]
+__all__ = ["Export", "Import", "Score"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Export(ProgressOptions):
+class _Alone(ProgressOptions):
+    """Of commands that work in one process, and write a folder of their own."""
+
+    overwrite: bool = False
+    """Start clean: delete what an earlier run left in the output folder."""
+    wait: bool = False
+    """Wait for another command that is writing to the same folder, instead of refusing."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export(_Alone):
     """Hand a registered or animated garment on to other tools: USD, Alembic, GLB, point caches, a mesh a frame."""
 
     work: Annotated[Positional[Path], arg(metavar="WORK")]
@@ -31,10 +42,6 @@ class Export(ProgressOptions):
     """Folder to write; WORK/exports if absent."""
     frames: str = ""
     """Only these frames of the take, such as 1,5,10-20 or, every fifth, 1-200:5."""
-    overwrite: bool = False
-    """Start clean: delete what an earlier run left in the output folder."""
-    wait: bool = False
-    """Wait for another command that is writing to the same folder, instead of refusing."""
     config: Annotated[ExportConfig, arg(name="")] = field(default_factory=ExportConfig)
 
     def __call__(self) -> int:
@@ -71,3 +78,55 @@ def _error(largest: float, fit: object, targets: int | None) -> str:
         return f"read back within {largest:.4f} mm"
     mean, p99 = getattr(fit, "mean_mm", 0.0), getattr(fit, "p99_mm", 0.0)
     return f"{targets} shapes, error {mean:.3f} mm in the mean, {p99:.3f} at 99 %, {largest:.3f} at most"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Import(_Alone, MeshOptions):
+    """Bring in a sequence that another tool registered or edited: USD, Alembic, a point cache, a mesh file a frame."""
+
+    meshes: Annotated[Positional[Path], arg(metavar="MESHES")]
+    """Folder with a mesh file a frame, its number in its name; or a .usd, .usda, .usdc, .abc, .pc2 or .mdd file."""
+    template: Path
+    """The mesh that moves, in the same order of vertices: template.npz or garment.npz, or a mesh file."""
+    output: Path
+    """Work folder; gets registration/."""
+    config: Annotated[ImportConfig, arg(name="")] = field(default_factory=ImportConfig)
+
+    def __call__(self) -> int:
+        from capture4d import pipeline
+
+        result = pipeline.import_meshes(
+            self.meshes, self.template, self.output, self.config, overwrite=self.overwrite
+        )
+        print(f"import: {result.frames} frames")
+        print(f"registration: {result.path}")
+        return GOOD
+
+
+@dataclass(frozen=True, kw_only=True)
+class Score(StageOptions):
+    """Measure a registered sequence, whoever made it, against the truth of a synthetic take, as its report would."""
+
+    work: Annotated[Positional[Path], arg(metavar="WORK")]
+    """Work folder, such as `import` writes; gets score.json."""
+    capture: Annotated[Positional[Path], arg(metavar="CAPTURE")]
+    """Capture folder with its truth, of the same template."""
+    fail_above: UseAppendAction[tuple[Annotated[str, arg(metavar="METRIC=LIMIT")], ...]] = ()
+    """Exit with 3 if this metric is above the limit; may be given several times."""
+
+    def __call__(self) -> int:
+        from capture4d import pipeline
+        from capture4d.app.report.limits import broken_among, parse_limits
+        from capture4d.app.report.metrics import METRICS, shown
+
+        limits = parse_limits(self.fail_above)
+        found = pipeline.score(self.work, self.capture, workers=self.workers)
+        if found.without_scan:
+            print("capture4d: what was scanned is not known; every vertex counts as seen", file=sys.stderr)
+        for key, value in found.metrics.items():
+            print(f"{key:32s} {shown(value):>8s} {METRICS[key][0]}".rstrip())
+        print(f"score: {found.frames} frames: {found.path}")
+        broken = broken_among(found.metrics, limits, where=found.path)
+        for line in broken:
+            print(f"capture4d: {line}", file=sys.stderr)
+        return BAD_RESULT if broken else GOOD
