@@ -9,7 +9,7 @@ from capture4d.settings import Positive, Range, settings
 
 __all__ = ["FORMATS", "ExportConfig", "Format", "GlbConfig"]
 
-Format = Literal["usd", "abc", "glb", "pc2", "mdd", "obj", "ply"]
+Format = Literal["usd", "abc", "glb", "pc2", "mdd", "obj", "ply", "html"]
 FORMATS: tuple[Format, ...] = get_args(Format)
 
 

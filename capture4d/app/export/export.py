@@ -29,7 +29,7 @@ def export(
     """Hand a registered or animated garment on to other tools: a file for each format, each read back.
 
     Args:
-        formats: of "usd", "abc", "glb", "pc2", "mdd", "obj", "ply".
+        formats: of "usd", "abc", "glb", "pc2", "mdd", "obj", "ply", "html".
         output: folder to write; WORK/exports if None.
         frames: only these, such as "1-200:5".
     """

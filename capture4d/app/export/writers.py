@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from capture4d.app.export.config import ExportConfig, Format
 from capture4d.app.export.correctives import FitError, exact_targets, fit_targets
 from capture4d.app.export.glb_check import largest_glb_difference
 from capture4d.app.export.maps import map_bytes, map_name
+from capture4d.app.export.web_page import require_page, write_page
 from capture4d.errors import InputError
 from capture4d.files.atomic import write_bytes
 from capture4d.mesh_files.animated.alembic import read_alembic, write_alembic
@@ -29,6 +30,7 @@ BASE = "garment.obj"
 """The mesh that point caches belong to."""
 _FILES: Mapping[Format, str] = {
     "usd": "garment.usdc", "abc": "garment.abc", "glb": "garment.glb", "pc2": "garment.pc2", "mdd": "garment.mdd",
+    "html": "garment.html",
 }  # fmt: skip
 _SMOOTH = b"s 1\n"
 """One smoothing group: without it Blender shades an OBJ flat."""
@@ -77,6 +79,8 @@ def write_format(kind: Format, folder: Path, clip: Clip, config: ExportConfig) -
             found = read_alembic(path, moving.fps)
         case "glb":
             return _write_glb(path, clip, config)
+        case "html":
+            return _write_page(path, clip, config)
         case "pc2":
             write_pc2(path, moving)
             found = read_pc2(path, moving.mesh)
@@ -137,6 +141,15 @@ def _write_glb(path: Path, clip: Clip, config: ExportConfig) -> Written:
     broken = {name: limit for name, limit in limits.items() if getattr(error, name) > limit}
     faults = [f"{name} {getattr(error, name):.3f} > {limit:g}" for name, limit in broken.items()]
     return Written(path.name, error.max_mm, error, len(targets.directions), faults)
+
+
+def _write_page(path: Path, clip: Clip, config: ExportConfig) -> Written:
+    inside = path.with_name("inside.glb")
+    made = _write_glb(inside, clip, config)
+    write_page(path, inside, clip)
+    require_page(path, inside, clip)
+    inside.unlink()
+    return replace(made, file=path.name)
 
 
 def _require_close(path: Path, error_mm: float, limit_mm: float) -> None:
