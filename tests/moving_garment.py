@@ -1,4 +1,4 @@
-"""A work folder with a garment that moves, as `animate` leaves one: a tube with a UV seam around a limb of six joints."""
+"""A work folder with a garment that moves, as `animate` leaves one: a tube with a seam around a limb of six joints."""
 
 from __future__ import annotations
 

@@ -5,7 +5,8 @@
 
 FILE: .glb .gltf .usd .usda .usdc .usdz .abc, or .pc2 .mdd with --base garment.obj.
 VERTICES: (T, V, 3) float32, metres, Y up. Reads the *evaluated* mesh in every frame (modifiers, shape keys, skeleton,
-caches), takes it from Blender's world (Z up) back to Y up, and compares. Prints one line per finding and, at last, one of JSON.
+caches), takes it from Blender's world (Z up) back to Y up, and compares.
+Prints one line per finding and, at last, one of JSON.
 Exit code 0: everything that was asked for is there; 1: a mismatch; 2: Blender cannot read this format.
 """
 

@@ -1,6 +1,6 @@
 """Exports opened in real clients: Blender, three.js in Chromium, Khronos' validator. Skipped where these are absent.
 
-    CAPTURE4D_BLENDER=/path/to/python-with-bpy NODE_MODULES=/path/to/node_modules pytest tests/judges -m slow
+CAPTURE4D_BLENDER=/path/to/python-with-bpy NODE_MODULES=/path/to/node_modules pytest tests/judges -m slow
 """
 
 import os
@@ -45,7 +45,9 @@ def judged(*arguments: object) -> None:
     done = subprocess.run([str(each) for each in arguments], capture_output=True, text=True, check=False)
     if done.returncode == CANNOT_READ:
         pytest.skip(done.stdout.strip().splitlines()[-1])
-    assert done.returncode == 0, "\n".join(line for line in done.stdout.splitlines() if "MISMATCH" in line) or done.stderr
+    assert done.returncode == 0, (
+        "\n".join(line for line in done.stdout.splitlines() if "MISMATCH" in line) or done.stderr
+    )
 
 
 @needs_blender

@@ -62,7 +62,9 @@ def read_clip(work: WorkFolder, frames: str = "", *, with_maps: bool = True) -> 
     rows = np.searchsorted(registered.frame_ids, np.array(chosen))
     failed = sorted(work.failed_frames & {*chosen})
     if failed:
-        notes.append(f"{len(failed)} of {len(chosen)} frames have failed, and are exported as they are: {listed(failed)}")
+        notes.append(
+            f"{len(failed)} of {len(chosen)} frames have failed, and are exported as they are: {listed(failed)}"
+        )
     maps, mesh = (_maps(work, notes) if with_maps else None), registered.garment.template
     if maps is not None:
         missing = [frame_id for frame_id in chosen if not maps.file(frame_id).is_file()]

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float64
 
 from capture4d.app.export.skeleton import Skeleton
 from capture4d.body.skinning import blend_transforms, skin, unskin

@@ -31,7 +31,11 @@ def largest_glb_difference(path: Path, moving: MovingMesh) -> float:
         count = len(moving.frame_ids)
         wanted = moving.times_s() - moving.times_s()[0]
         for times, _, _, values in keys:
-            if len(times) != count or len(values) != count or np.abs(times - wanted).max() > 1e-3 / max(moving.fps or 1, 1):
+            if (
+                len(times) != count
+                or len(values) != count
+                or np.abs(times - wanted).max() > 1e-3 / max(moving.fps or 1, 1)
+            ):
                 raise InputError("read back: expected the times of the frames that were written, found others")
         chosen, largest = set(np.linspace(0, count - 1, min(count, _LOOKED_AT)).round().astype(int).tolist()), 0.0
         for frame, vertices in enumerate(moving.frames()):

@@ -24,7 +24,7 @@ import numpy as np
 from capture4d.app.export.clip import Clip, read_clip
 from capture4d.app.export.config import ExportConfig, Format
 from capture4d.app.export.maps import map_name, write_maps
-from capture4d.app.export.writers import BASE, Written, file_of, write_format, write_sequence
+from capture4d.app.export.writers import Written, file_of, write_format, write_sequence
 from capture4d.captures.work_folder import WorkFolder
 from capture4d.errors import InputError
 from capture4d.files.atomic import TEMPORARY_SUFFIX, read_json, write_bytes, write_json

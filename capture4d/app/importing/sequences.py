@@ -56,7 +56,9 @@ def read_sequence(path: Path, template: Mesh, config: ImportConfig) -> MovingMes
             where=path,
         )
     if not _have_same_faces(found.mesh, template):
-        raise InputError("expected the faces of the template, found others: the order of its vertices is lost", where=path)
+        raise InputError(
+            "expected the faces of the template, found others: the order of its vertices is lost", where=path
+        )
     return replace(found, mesh=template, fps=config.fps or found.fps, frames=partial(_placed, found, config, path))
 
 
@@ -75,7 +77,9 @@ def _opened(path: Path, template: Mesh, config: ImportConfig) -> MovingMesh:
             return read_pc2(path, template)
         case ".mdd":
             if config.fps is None:
-                raise InputError("--fps: expected the frame rate, which an mdd file does not tell, found none", where=path)
+                raise InputError(
+                    "--fps: expected the frame rate, which an mdd file does not tell, found none", where=path
+                )
             return read_mdd(path, template, config.fps)
         case suffix:
             kinds = "a folder of mesh files, or .usd, .usda, .usdc, .usdz, .abc, .pc2, .mdd"

@@ -95,9 +95,7 @@ class Import(_Alone, MeshOptions):
     def __call__(self) -> int:
         from capture4d import pipeline
 
-        result = pipeline.import_meshes(
-            self.meshes, self.template, self.output, self.config, overwrite=self.overwrite
-        )
+        result = pipeline.import_meshes(self.meshes, self.template, self.output, self.config, overwrite=self.overwrite)
         print(f"import: {result.frames} frames")
         print(f"registration: {result.path}")
         return GOOD

@@ -87,7 +87,7 @@ def _integers(values: np.ndarray) -> Any:
 
 
 def read_alembic(path: Path, fps: float | None = None) -> MovingMesh:
-    """The mesh with the most vertices in a file. Where its transforms put it is not read: a file that has any is refused.
+    """The mesh with the most vertices in a file. Transforms are not read: a file in which they do anything is refused.
 
     Args:
         fps: frames a second; that of the file's own samples, taken for one a frame, if None.
@@ -101,7 +101,9 @@ def read_alembic(path: Path, fps: float | None = None) -> MovingMesh:
             archive = Abc.IArchive(str(path))
         except Exception as error:  # the bindings hand on C++ exceptions of several kinds
             raise InputError(f"not an Alembic file, or damaged ({str(error)[:120]})") from None
-        schemas = [AbcGeom.IPolyMesh(each.getParent(), each.getName()).getSchema() for each in _meshes(archive, AbcGeom)]
+        schemas = [
+            AbcGeom.IPolyMesh(each.getParent(), each.getName()).getSchema() for each in _meshes(archive, AbcGeom)
+        ]
         if not schemas:
             raise InputError("expected a mesh, found none")
         schema = max(schemas, key=lambda each: len(each.getValue(next(_selectors(each))).getPositions()))
@@ -131,7 +133,9 @@ def _meshes(archive: Any, AbcGeom: Any) -> Iterator[Any]:
             elif AbcGeom.IXform.matches(child.getMetaData()):
                 schema = AbcGeom.IXform(each, child.getName()).getSchema()
                 if schema.getNumOps() and not schema.isConstantIdentity():
-                    raise InputError(f"'{child.getName()}': expected no transform, found one; freeze it and export again")
+                    raise InputError(
+                        f"'{child.getName()}': expected no transform, found one; freeze it and export again"
+                    )
 
 
 def _shape(sample: Any, schema: Any, vertices: np.ndarray) -> Mesh:

@@ -189,7 +189,9 @@ def _shape(mesh: Any, time: float, vertices: np.ndarray) -> Mesh:
         flat = flat[corners] if by_vertex and len(flat) > corners.max(initial=-1) else flat
         uv = flat if len(flat) == len(corners) else None
     if mesh.GetOrientationAttr().Get() == "leftHanded":
-        order = np.concatenate([np.arange(end - size, end)[::-1] for size, end in zip(sizes, sizes.cumsum(), strict=True)])
+        order = np.concatenate(
+            [np.arange(end - size, end)[::-1] for size, end in zip(sizes, sizes.cumsum(), strict=True)]
+        )
         corners, uv = corners[order], None if uv is None else uv[order]
     return polygon_mesh(vertices, corners, sizes, uv)[0].mesh
 

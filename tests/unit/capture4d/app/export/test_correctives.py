@@ -153,5 +153,5 @@ def test_reading_back_finds_a_vertex_that_is_elsewhere(tmp_path: Path):
     path.write_bytes(data)
     assert largest_glb_difference(path, moving) == pytest.approx(0.0002, rel=1e-2)
     path.write_bytes(data[:-8])
-    with pytest.raises(InputError, match="garment.glb"):
+    with pytest.raises(InputError, match=r"garment\.glb"):
         largest_glb_difference(path, moving)

@@ -16,7 +16,9 @@ from capture4d.mesh_files.animated.usd import read_usd, usd_faults, write_usd
 from capture4d.types import Mesh
 from tests.moving_garment import cloth
 
-needs_usd = pytest.mark.skipif(not importlib.util.find_spec("pxr"), reason="usd-core is not installed: USD is not tried")
+needs_usd = pytest.mark.skipif(
+    not importlib.util.find_spec("pxr"), reason="usd-core is not installed: USD is not tried"
+)
 needs_alembic = pytest.mark.skipif(
     not importlib.util.find_spec("alembic3d"), reason="alembic3d is not installed: Alembic is not tried"
 )
@@ -66,7 +68,7 @@ def test_a_cache_of_another_mesh_or_cut_off_is_one_line(tmp_path: Path):
 
 def test_a_cache_cannot_hold_frames_with_gaps(tmp_path: Path):
     odd = replace(moving(3), frame_ids=np.array([1, 2, 5], np.int32))
-    with pytest.raises(InputError, match="pc2: expected frames 1 apart, .* found frame 5 after frame 2"):
+    with pytest.raises(InputError, match=r"pc2: expected frames 1 apart, .* found frame 5 after frame 2"):
         write_pc2(tmp_path / "a.pc2", odd)
     assert not list(tmp_path.iterdir())
 
