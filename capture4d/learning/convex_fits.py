@@ -20,9 +20,7 @@ HEAVY = 1e3
 """Weight of the row that makes shares sum to 1, over the largest coordinate."""
 
 
-def convex_weights(
-    points: Float[np.ndarray, "K D"], target: Float[np.ndarray, " D"]
-) -> Float64[np.ndarray, " K"]:
+def convex_weights(points: Float[np.ndarray, "K D"], target: Float[np.ndarray, " D"]) -> Float64[np.ndarray, " K"]:
     """Shares of the points, none negative, all together 1, whose weighted mean lies nearest to the target."""
     origin = points.mean(axis=0, dtype=np.float64)
     rows, wanted = points - origin, target - origin

@@ -54,7 +54,7 @@ _PAPER_SHAPES = ((0.0, 0.0), *((value, 0.0) for value in _HALVES), *((0.0, value
 """First and second component at +-1 and +-2, and the mean person, as in the released data."""
 
 STYLE_SETS: dict[str, StyleSetConfig] = {
-    "tiny-styles": StyleSetConfig(),
+    "tiny-styles": StyleSetConfig(pose=PoseConfig(hip_flexion=(-10.0, 70.0), knee=(0.0, 100.0))),
     "tshirt-styles": StyleSetConfig(
         garment="tshirt",
         styles={"size": (0.9, 0.96, 1.02, 1.08, 1.15), "sleeve_length": (0.3, 0.48, 0.66, 0.84, 1.02)},

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from itertools import product
+from itertools import pairwise, product
 from typing import Literal
 
 import numpy as np
@@ -18,7 +18,7 @@ from capture4d.learning.convex_fits import furthest_first
 from data_synth.drapes.config import STYLES
 from data_synth.styles.config import StyleSetConfig
 
-__all__ = ["Pair", "choose_prototypes", "grid", "ranges_of", "require_possible", "test_pairs"]
+__all__ = ["Pair", "choose_prototypes", "draw_test_pairs", "grid", "ranges_of", "require_possible"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +46,7 @@ def require_possible(config: StyleSetConfig) -> None:
     for name, values in config.styles.items():
         if name not in known:
             raise InputError(f"styles: expected numbers of a {config.garment}, {', '.join(known)}; found '{name}'")
-        if len(values) < 2 or any(first >= second for first, second in zip(values, values[1:], strict=False)):
+        if len(values) < 2 or any(first >= second for first, second in pairwise(values)):
             raise InputError(f"styles.{name}: expected two or more ascending values, found {values}")
     if any(config.shapes[0]) or len({len(shape) for shape in config.shapes}) > 1:
         raise InputError("shapes: expected the mean person first, and as many numbers for all, found others")
@@ -95,7 +95,7 @@ def choose_prototypes(
     return furthest_first(displacements.reshape(len(displacements), -1), [*first], count, distance)
 
 
-def test_pairs(
+def draw_test_pairs(
     config: StyleSetConfig, pairs: Sequence[Pair], prototypes: Sequence[int], rng: np.random.Generator
 ) -> tuple[list[int], list[Pair]]:
     """Pairs to test with: indices of some at random that are no prototypes, and others off the grid."""

@@ -33,7 +33,7 @@ from data_synth.drapes.draping import Draper, symmetric_person
 from data_synth.drapes.dressing import base_garment
 from data_synth.drapes.stage import run as drape_set
 from data_synth.styles.config import StyleSetConfig
-from data_synth.styles.pairs import Pair, choose_prototypes, grid, ranges_of, require_possible, test_pairs
+from data_synth.styles.pairs import Pair, choose_prototypes, draw_test_pairs, grid, ranges_of, require_possible
 
 __all__ = ["run"]
 
@@ -73,12 +73,15 @@ def run(output: Path, config: StyleSetConfig, *, workers: int = 1, overwrite: bo
     prototypes, errors = choose_prototypes(
         _displacements(pairs, vertices, faces, body), config.prototypes, config.start, len(config.shapes)
     )
-    tested, off_grid = test_pairs(config, pairs, prototypes, np.random.default_rng([config.seed, 7]))
+    tested, off_grid = draw_test_pairs(config, pairs, prototypes, np.random.default_rng([config.seed, 7]))
     every = [*pairs, *off_grid]
     vertices, faces = _at_rest(stage, config, every, body, workers)
     chosen = [
         *(_Chosen(f"prototype-{k:02d}", "prototype", each) for k, each in enumerate(prototypes, 1)),
-        *(_Chosen(f"test-{k:02d}", "test", each) for k, each in enumerate([*tested, *range(len(pairs), len(every))], 1)),
+        *(
+            _Chosen(f"test-{k:02d}", "test", each)
+            for k, each in enumerate([*tested, *range(len(pairs), len(every))], 1)
+        ),
     ]
     sets = [_drape(output, config, every[each.canonical], each, workers) for each in chosen]
     test = np.zeros(len(every), bool)
@@ -197,6 +200,7 @@ def _described(
             for each, digest in zip(chosen, digests, strict=True)
         },
         "convex_fits_mm": [
-            {"prototypes": first + k, "worst": 1e3 * worst, "mean": 1e3 * mean} for k, (worst, mean) in enumerate(errors)
+            {"prototypes": first + k, "worst": 1e3 * worst, "mean": 1e3 * mean}
+            for k, (worst, mean) in enumerate(errors)
         ],
     }

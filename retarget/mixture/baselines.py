@@ -65,9 +65,7 @@ def blended_prototypes(lesson: StyleLesson, garment: StyledGarment) -> Unposed:
     return predict
 
 
-def _nearest_poses(
-    garment: StyledGarment, pair: PairDrapes, learned: PairDrapes
-) -> Int[np.ndarray, " drapes"]:
+def _nearest_poses(garment: StyledGarment, pair: PairDrapes, learned: PairDrapes) -> Int[np.ndarray, " drapes"]:
     """For each drape of a pair, the drape of another in the most alike of the poses that may be learned from."""
     ours: Float64[np.ndarray, "drapes numbers"] = garment.pose.of(pair.rotations).astype(np.float64)
     seen = np.flatnonzero(~learned.unseen)

@@ -7,7 +7,15 @@ from typing import Annotated, Literal
 
 from capture4d.settings import Count, NonNegative, Part, Positive, Range, Seed, settings
 
-__all__ = ["PRESETS", "CanonicalConfig", "KernelConfig", "MixtureConfig", "NetworkConfig", "SplitConfig", "StylesConfig"]
+__all__ = [
+    "PRESETS",
+    "CanonicalConfig",
+    "KernelConfig",
+    "MixtureConfig",
+    "NetworkConfig",
+    "SplitConfig",
+    "StylesConfig",
+]
 
 
 @settings
@@ -39,7 +47,7 @@ class NetworkConfig:
     patience: Count = 100
     """Epochs without a better validation error after which training stops."""
     batch: Count = 32
-    """Drapes in a step."""
+    """Drapes in a step at most: a small set is learned from in eight steps, unless they would be of fewer than four."""
     learning_rate: Positive = 1e-3
     """Of Adam."""
     falling: bool = True
@@ -123,8 +131,6 @@ class StylesConfig:
     mixture: MixtureConfig = field(default_factory=MixtureConfig)
     checkpoint_every: Count = 50
     """Epochs; they change nothing in the result."""
-    threads: Count = 1
-    """Threads of torch; results are the same bits only for the same number."""
     seed: Seed = 0
     """Of the first weights, the order of the drapes and what is held back for validation."""
 

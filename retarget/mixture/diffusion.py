@@ -58,9 +58,7 @@ class Diffusion:
     steps: int
 
     @staticmethod
-    def create(
-        faces: Integer[np.ndarray, "F 3"], rest: Float[np.ndarray, "V 3"], config: SplitConfig
-    ) -> Diffusion:
+    def create(faces: Integer[np.ndarray, "F 3"], rest: Float[np.ndarray, "V 3"], config: SplitConfig) -> Diffusion:
         """The smoothing of a mesh.
 
         On a surface a wave of length w has mu = (pi e / w)^2 for edges of length e, as long as w is much longer; the
@@ -73,7 +71,7 @@ class Diffusion:
         if config.printed:
             return Diffusion(laplacian, PRINTED_RATE, PRINTED_STEPS)
         edge = float(np.sqrt((edge_lengths(rest.astype(np.float64), unique_edges(faces)) ** 2).mean()))
-        wanted = np.log(2) / (np.pi * edge / config.half_m) ** 2  # rate * steps
+        wanted = float(np.log(2) / (np.pi * edge / config.half_m) ** 2)  # rate * steps
         steps = max(1, int(np.ceil(wanted / PRINTED_RATE)))
         return Diffusion(laplacian, min(wanted / steps, PRINTED_RATE), steps)
 

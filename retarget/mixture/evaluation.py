@@ -61,7 +61,8 @@ def measure(lesson: StyleLesson, predict: Unposed) -> Mapping[Part, PartErrors]:
     found: dict[Part, PartErrors] = {}
     for part in PARTS:
         rows = [
-            _drape_errors(lesson, diffusion, pair, predicted[pair.name], chosen) for pair, chosen in lesson.of_part(part)
+            _drape_errors(lesson, diffusion, pair, predicted[pair.name], chosen)
+            for pair, chosen in lesson.of_part(part)
         ]
         if rows:
             found[part] = _joined(rows)

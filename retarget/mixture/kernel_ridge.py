@@ -32,7 +32,7 @@ class KernelRidge:
     """Weight of the linear kernel, which goes on where nothing was learned."""
 
     def predict(self, asked: Float[np.ndarray, "rows numbers"]) -> Float64[np.ndarray, "rows outputs"]:
-        return _alike(asked / self.length, self.points, self.line) @ self.answers
+        return _alike(asked.astype(np.float64) / self.length, self.points, self.line) @ self.answers
 
 
 def _alike(

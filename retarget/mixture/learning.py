@@ -37,17 +37,18 @@ Learned = tuple[StyledGarment, dict[str, Any], list[dict[str, Any]]]
 """A garment, what there is to say of how it was learned, and a row for every epoch."""
 
 
-def learn_styles(lesson: StyleLesson, config: StylesConfig, folder: Path) -> Learned:
+def learn_styles(lesson: StyleLesson, config: StylesConfig, folder: Path, *, threads: int = 1) -> Learned:
     """Learn from the prototypes of a lesson, in the poses that may be learned from.
 
     Args:
         folder: gets a checkpoint of each network, from which the same call goes on.
+        threads: of torch; results are the same bits only for the same number.
     Raises:
         InputError: there is nothing to learn from, the loss is no number any more, or a checkpoint is damaged.
     """
     if config.method == "ensemble" and not (config.members or config.kernels):
         raise InputError("members, kernels: expected networks, kernels or both, found neither")
-    with _threads(config.threads):
+    with _threads(threads):
         return _Learning(lesson, config, folder).learned()
 
 
@@ -120,7 +121,7 @@ class _Learning:
             regression, off = fit_left_out(lesson.pool_numbers, flat, lengths=config.lengths, ridges=config.ridges)
             self.note["a_pose"] = {
                 "length": regression.length,
-                "left_out_rms_mm": 1e3 * off / np.sqrt(flat.shape[1] / 3),
+                "left_out_rms_mm": 1e3 * off / float(np.sqrt(flat.shape[1] / 3)),
             }
             return Canonical(regression, np.zeros(lesson.pool.shape[1:]))
         inputs, wanted = lesson.pool_numbers.astype(np.float32), flat.astype(np.float32)
@@ -151,7 +152,9 @@ class _Learning:
         """Of what is learned from, the checked poses left out."""
         if config.heads == "vertices":
             return Head.of_vertices(targets[0].shape[1])
-        shown = [wanted[rows & ~self._checked(pair, rows)] for (pair, rows), wanted in zip(self.seen, targets, strict=True)]
+        shown = [
+            wanted[rows & ~self._checked(pair, rows)] for (pair, rows), wanted in zip(self.seen, targets, strict=True)
+        ]
         return Head.of_directions(np.concatenate(shown), config.directions)
 
     def _ensemble(self, canonical: Canonical) -> Predictor:

@@ -30,7 +30,10 @@ def squared_distances(
 ) -> Float64[np.ndarray, "N K"]:
     """`dist` of each garment to each prototype, of displacements over the body in the A-pose, metres."""
     return np.array(
-        [[SCALE * ((one.astype(np.float64) - other) ** 2).sum(axis=1).mean() for other in prototypes] for one in garments]
+        [
+            [SCALE * ((one.astype(np.float64) - other) ** 2).sum(axis=1).mean() for other in prototypes]
+            for one in garments
+        ]
     ).reshape(len(garments), len(prototypes))
 
 

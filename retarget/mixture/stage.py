@@ -29,12 +29,13 @@ SCHEMA = 1
 FILES = ("garment.npz", "body.npz", MODEL, "errors.json")
 
 
-def run(styles: Path, output: Path, config: StylesConfig, *, overwrite: bool = False) -> StageResult:
+def run(styles: Path, output: Path, config: StylesConfig, *, workers: int = 1, overwrite: bool = False) -> StageResult:
     """Learn a garment from a style set, unless that has been done.
 
     Args:
         styles: what `synth-drapes --preset` wrote.
         output: folder to write.
+        workers: torch's threads.
     Raises:
         InputError: the style set is missing, unfinished or damaged, or has nothing to learn from.
     """
@@ -47,7 +48,7 @@ def run(styles: Path, output: Path, config: StylesConfig, *, overwrite: bool = F
     if stage.was_complete and all(path.is_file() for path in paths):
         return stage.finish(paths, changed=False)
     lesson = style_lesson(source)
-    garment, note, history = learn_styles(lesson, config, output / "checkpoints")
+    garment, note, history = learn_styles(lesson, config, output / "checkpoints", threads=workers)
     save_styled_garment(output, garment)
     errors = {part: nan_to_none(asdict(found)) for part, found in measure(lesson, unposed_by(garment)).items()}
     write_json(output / "errors.json", {"learned": note, "errors": errors})

@@ -1,9 +1,7 @@
 """A learned garment with styles: pose, shape and style in, vertices out.
 
     garment = load_styled_garment(Path("model"))
-    garment.vertices(rotations, beta=(1.0, -0.5), style={"length": 0.7})
-
-Letters: T frames, V vertices, J joints.
+    garment.vertices(poses, beta=(1.0, -0.5), style={"length": 0.7})
 
 References: TailorNet (CVPR 2020), equations 3, 4 and 8.
 """
@@ -23,7 +21,7 @@ from capture4d.captures.drapes.style_sets import Ranges
 from capture4d.errors import InputError
 from capture4d.geometry.intersection_removal import IntersectionRemoval
 from capture4d.geometry.mesh import edge_lengths, unique_edges
-from capture4d.types import Body, Garment
+from capture4d.types import Body, Garment, PoseSequence
 from retarget.config import RemovalConfig
 from retarget.mixture.heads import PoseNumbers
 from retarget.mixture.kernel_ridge import KernelRidge
@@ -71,35 +69,35 @@ class StyledGarment:
 
     def vertices(
         self,
-        rotations: Float[np.ndarray, "*frames joints 3 3"],
-        beta: Sequence[float] = (),
+        pose: PoseSequence,
+        beta: Sequence[float] | Float[np.ndarray, " betas"] = (),
         style: Mapping[str, float] | None = None,
         *,
-        translations: Float[np.ndarray, "*frames 3"] | None = None,
-        outside: bool = True,
-    ) -> Float32[np.ndarray, "*frames verts 3"]:
-        """The garment in a pose, (V, 3), or in many, (T, V, 3), metres.
+        remove_intersections: bool = True,
+    ) -> Float32[np.ndarray, "frames verts 3"]:
+        """The garment of a style on a person, metres, world, a row for each pose.
+
+        A pose alone decides: what went before it plays no part. The root turns the garment as a whole.
 
         Args:
-            rotations: of each joint against its parent, about axes aligned with the world; the root's turns all.
-            beta: shape of the person, in standard deviations.
+            beta: shape coefficients of the person, of which the last may be left out.
             style: numbers of the pattern, by name; in the middle of their range if left out.
-            translations: of the root joint, metres.
-            outside: take the garment out of the body, and keep its edges.
+            remove_intersections: move what is inside the body out of it.
         Raises:
-            InputError: the rotations are not of the body's joints, or style or shape are outside what was learned.
+            InputError: the poses are of another skeleton, or style or shape are outside what was learned.
         """
-        one = rotations.ndim == 3
-        frames = rotations[None] if one else rotations
-        places = np.zeros((len(frames), 3)) if translations is None else translations.reshape(-1, 3)
-        if len(places) != len(frames):
-            raise InputError(f"translations: expected {len(frames)}, found {len(places)}")
-        worn = self.worn(beta, style)
-        found = [*worn.frames(zip(frames, places, strict=True), outside=outside)]
-        stacked = np.stack(found) if found else np.zeros((0, len(self.garment.template.vertices), 3), np.float32)
-        return stacked[0] if one else stacked
+        if pose.joint_names != self.body.joint_names:
+            raise InputError(
+                f"pose: expected the {len(self.body.joint_names)} joints of the model, found {len(pose.joint_names)} "
+                f"({', '.join(pose.joint_names[:4])}, ...)"
+            )
+        frames = zip(pose.rotations, pose.translations, strict=True)
+        found = [*self.worn(beta, style).frames(frames, remove_intersections=remove_intersections)]
+        return np.stack(found) if found else np.zeros((0, len(self.garment.template.vertices), 3), np.float32)
 
-    def worn(self, beta: Sequence[float] = (), style: Mapping[str, float] | None = None) -> WornGarment:
+    def worn(
+        self, beta: Sequence[float] | Float[np.ndarray, " betas"] = (), style: Mapping[str, float] | None = None
+    ) -> WornGarment:
         """The garment of a style on a person, with everything computed once that frames share.
 
         Raises:
@@ -108,7 +106,9 @@ class StyledGarment:
         unknown = [name for name in style or {} if name not in self.ranges.style]
         if unknown:
             raise InputError(f"style: expected {', '.join(self.ranges.style)}, found '{unknown[0]}'")
-        return WornGarment(self, self.ranges.numbers(style or {}, beta), with_shape(self.body, np.array(beta)))
+        return WornGarment(
+            self, self.ranges.numbers(style or {}, beta), with_shape(self.body, np.asarray(beta, np.float64))
+        )
 
 
 class WornGarment:
@@ -118,9 +118,7 @@ class WornGarment:
         numbers: style and shape, from -1 to 1.
     """
 
-    def __init__(
-        self, garment: StyledGarment, numbers: Float64[np.ndarray, " numbers"], person: ShapedBody
-    ) -> None:
+    def __init__(self, garment: StyledGarment, numbers: Float64[np.ndarray, " numbers"], person: ShapedBody) -> None:
         self._garment, self._numbers, self._person = garment, numbers, person
         self._under = person_under(garment.garment, garment.body, np.asarray(person.shape, np.float32))
         self._canonical = garment.canonical(numbers)
@@ -143,7 +141,7 @@ class WornGarment:
         self,
         poses: Iterable[tuple[Float[np.ndarray, "joints 3 3"], Float[np.ndarray, "3"]]],
         *,
-        outside: bool = True,
+        remove_intersections: bool = True,
     ) -> Iterator[Float32[np.ndarray, "verts 3"]]:
         """The garment in one pose after the other, as they come, metres; rotations and the root's translation."""
         for rotations, translation in poses:
@@ -151,7 +149,7 @@ class WornGarment:
             weights = self._garment.garment.skin_weights
             assert weights is not None
             vertices = skin(self.unposed(rotations[None])[0], weights, body.transforms)
-            if outside:
+            if remove_intersections:
                 removal, worn = self._contacts()
                 vertices = removal(vertices, worn.posed(body.vertices())).vertices
             yield vertices.astype(np.float32)

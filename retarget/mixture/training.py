@@ -31,6 +31,8 @@ __all__ = ["Examples", "Trained", "Trainer", "made_network", "said_by"]
 
 KIND = "training of styles"
 COMMAND = "capture4d fit-styles STYLES --output MODEL"
+STEPS, SMALLEST_BATCH = 8, 4
+"""Of an epoch at least, unless a step would be of fewer drapes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,6 +133,10 @@ class _Run:
         return _Run(network, copy.deepcopy(network), optimiser, rows, config, [], [])
 
     @property
+    def batch(self) -> int:
+        return min(self.config.batch, max(SMALLEST_BATCH, len(self.tensors[0]) // STEPS))
+
+    @property
     def is_over(self) -> bool:
         done = len(self.errors)
         idle = done - 1 - int(np.argmin(self.errors)) if done else 0
@@ -145,7 +151,7 @@ class _Run:
                 group["lr"] = self.config.learning_rate * share
         self.network.train()
         losses = []
-        for rows in torch.randperm(len(inputs)).split(self.config.batch):
+        for rows in torch.randperm(len(inputs)).split(self.batch):
             loss = _loss(self.network(inputs[rows]), wanted[rows], self.config)
             self.optimiser.zero_grad(set_to_none=True)
             loss.backward()
@@ -170,9 +176,7 @@ class _Run:
 
     def resume(self, path: Path) -> None:
         modules = {"network": self.network, "best": self.best}
-        found, _ = read_checkpoint(
-            path, KIND, modules=modules, optimisers={"adam": self.optimiser}, command=COMMAND
-        )
+        found, _ = read_checkpoint(path, KIND, modules=modules, optimisers={"adam": self.optimiser}, command=COMMAND)
         if not {"losses", "errors"} <= set(found) or found["losses"].shape != found["errors"].shape:
             raise InputError("expected losses and errors of the epochs, found none", where=path)
         self.losses, self.errors = found["losses"].tolist(), found["errors"].tolist()
@@ -183,5 +187,3 @@ def _loss(said: Float[Tensor, "B outputs"], wanted: Float[Tensor, "B outputs"], 
     if config.loss == "l2":
         return ((said - wanted) ** 2).sum(dim=1).mean()
     return 3 * (said - wanted).abs().mean()
-
-

@@ -47,7 +47,9 @@ class DrapeSet:
         count, joints = len(self.numbers), len(self.body.joint_names)
         require_array("DrapeSet", "numbers", self.numbers, (None,), np.int32)
         require_array("DrapeSet", "rotations", self.rotations, (count, joints, 3, 3), np.float32)
-        require_array("DrapeSet", "vertices", self.vertices, (count, len(self.garment.template.vertices), 3), np.float32)
+        require_array(
+            "DrapeSet", "vertices", self.vertices, (count, len(self.garment.template.vertices), 3), np.float32
+        )
         require_array("DrapeSet", "kept", self.kept, (count,), np.bool_)
         require_array("DrapeSet", "shape", self.shape, (None,), np.float32)
         require_rotations("DrapeSet", "rotations", self.rotations)

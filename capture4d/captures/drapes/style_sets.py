@@ -1,12 +1,12 @@
-"""A style set: drapes of one garment in many styles on many people, and which of them are kept to test what was learned.
+"""A style set: drapes of one garment in many styles on many people, and which of them are kept for tests.
 
 OUT/styles.json          the range of every style number and shape component; pairs of style and shape, by name
 OUT/canonical.npz        every pair that was tried at rest in the A-pose (`styles`, `shapes`, `vertices`, `test`)
 OUT/pairs/NAME           a set of drapes of each prototype and each test pair, `capture4d.captures.drapes.drape_sets`
 
 A prototype is simulated in many poses. A test pair is one that nothing is learned from, in poses of either kind. Poses
-up to the number `unseen_poses` are learned from with no pair, so that there are four parts: prototypes or test pairs, in
-poses that were seen or not.
+up to the number `unseen_poses` are learned from with no pair, so that there are four parts: prototypes or test pairs,
+in poses that were seen or not.
 
 References: TailorNet (CVPR 2020), sections 5.2 and 5.3.
 """
@@ -189,7 +189,9 @@ def _rows(about: Mapping[str, Any]) -> list[tuple[str, Role, int]]:
     for name, value in pairs.items() if isinstance(pairs, dict) else ():
         role = text(entry(value, "role"), "role")
         if role not in get_args(Role) or Path(name).name != name:
-            raise InputError(f"pairs: expected roles of {' or '.join(get_args(Role))} by name, found {role!r}, {name!r}")
+            raise InputError(
+                f"pairs: expected roles of {' or '.join(get_args(Role))} by name, found {role!r}, {name!r}"
+            )
         found.append((name, role, whole(entry(value, "canonical"), "canonical")))
     if not any(role == "prototype" for _, role, _ in found):
         raise InputError("pairs: expected at least one prototype, found none")
