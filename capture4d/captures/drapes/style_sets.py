@@ -6,7 +6,8 @@ OUT/pairs/NAME           a set of drapes of each prototype and each test pair, `
 
 A prototype is simulated in many poses. A test pair is one that nothing is learned from, in poses of either kind. Poses
 up to the number `unseen_poses` are learned from with no pair, so that there are four parts: prototypes or test pairs,
-in poses that were seen or not.
+in poses that were seen or not. A pose is drawn from the seed and its number, again and again until no limb enters
+another, which may take one more draw on one person than on another: what is held back is held back by number.
 
 References: TailorNet (CVPR 2020), sections 5.2 and 5.3.
 """

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -9,6 +11,9 @@ from scipy.spatial.transform import Rotation
 from capture4d.body.skinning import skin, with_pose, with_shape
 from capture4d.captures.drapes.drape_sets import DrapeSet
 from capture4d.captures.drapes.style_sets import CanonicalDrapes, Ranges, StylePair, StyleSet
+from capture4d.files.atomic import write_json, write_npz
+from capture4d.files.records import save_body, save_garment
+from capture4d.runs.stage import open_stage
 from capture4d.types import Body, Garment, Mesh, PoseSequence
 from retarget.mixture.lesson import person_under
 from tests.shapes import tube
@@ -127,3 +132,40 @@ def motion(angles: list[float], places: np.ndarray | None = None) -> PoseSequenc
         bent(np.array(angles)), places.astype(np.float32), np.zeros(1, np.float32),
         np.arange(count, dtype=np.int32), 60.0, ("root", "knee", "toe"),
     )  # fmt: skip
+
+
+def write_style_set(folder: Path, styles: StyleSet) -> None:
+    """A style set as the documents say that it lies on disk."""
+    stage = open_stage(folder, name="synth-styles", schema=1, config={}, upstream={})
+    rows = [
+        int(np.flatnonzero((styles.canonical.vertices == pair.canonical).all(axis=(1, 2)))[0]) for pair in styles.pairs
+    ]
+    for pair in styles.pairs:
+        place, drapes = folder / "pairs" / pair.name, pair.drapes
+        inner = open_stage(place, name="synth-drapes", schema=1, config={}, upstream={})
+        save_garment(place / "garment.npz", drapes.garment)
+        save_body(place / "body.npz", drapes.body)
+        write_json(
+            place / "drapes.json", {"garment": drapes.name, "style": drapes.style, "shape": drapes.shape.tolist()}
+        )
+        for number, part in enumerate(np.array_split(np.arange(len(drapes.numbers)), 2), 1):
+            write_npz(
+                place / "shards" / f"{number:06d}.npz", drapes=drapes.numbers[part], rotations=drapes.rotations[part],
+                vertices=drapes.vertices[part], kept=drapes.kept[part],
+            )  # fmt: skip
+        inner.finish([place / "drapes.json"])
+    at_rest = styles.canonical
+    write_npz(
+        folder / "canonical.npz", styles=at_rest.styles, shapes=at_rest.shapes, vertices=at_rest.vertices,
+        test=at_rest.test,
+    )  # fmt: skip
+    about = {
+        "style_ranges": {name: list(limits) for name, limits in styles.ranges.style.items()},
+        "shape_ranges": [list(limits) for limits in styles.ranges.shape],
+        "unseen_poses": styles.unseen_poses,
+        "pairs": {
+            pair.name: {"role": pair.role, "canonical": row} for pair, row in zip(styles.pairs, rows, strict=True)
+        },
+    }
+    write_json(folder / "styles.json", about)
+    stage.finish([folder / "styles.json", folder / "canonical.npz"])

@@ -95,8 +95,11 @@ def test_what_is_learned_beats_what_learns_nothing(learned: dict[str, StyledGarm
     for part in ("train-test", "test-train", "test-test"):
         found = {name: each[part].vertex_mm for name, each in errors.items()}
         assert found["ensemble"] < 0.5 * found["skinned"]
-        assert found["ensemble"] < min(found["nearest"], found["blended"])
+        assert found["ensemble"] < found["nearest"]
         assert found["mixture"] < 0.6 * found["skinned"]
+    # what is linear in style and shape is a convex combination of the corners, where their drapes are known
+    assert errors["blended"]["test-train"].vertex_mm < 0.01
+    assert errors["ensemble"]["test-test"].vertex_mm < errors["blended"]["test-test"].vertex_mm
     assert errors["skinned"]["test-test"].fine_share == pytest.approx(0, abs=1e-9)
     assert 0.7 < errors["ensemble"]["test-test"].fine_share < 1.2
     assert errors["ensemble"]["test-test"].drapes == 6
@@ -131,7 +134,7 @@ def test_frames_as_they_come_are_those_of_a_batch(learned: dict[str, StyledGarme
 def test_cloth_is_taken_out_of_the_body(learned: dict[str, StyledGarment]):
     """A garment that is tighter than any that was draped."""
     garment = learned["ensemble"]
-    tight = replace(garment, canonical=replace(garment.canonical, mean=-0.35 * garment.garment.template.vertices
+    tight = replace(garment, canonical=replace(garment.canonical, mean=-0.6 * garment.garment.template.vertices
                                                * np.array([1, 0, 1])))  # fmt: skip
     poses = motion([0.0, 0.2])
     inside, outside = (tight.vertices(poses, [0.0], remove_intersections=each) for each in (False, True))
