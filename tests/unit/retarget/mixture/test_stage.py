@@ -1,4 +1,4 @@
-"""The stage: a style set on disk in, a model out; killed and continued to the same digest, refused where it is stale."""
+"""The stage: a style set on disk in, a model out; killed and continued to the same digest, refused where stale."""
 
 from __future__ import annotations
 
@@ -68,9 +68,7 @@ def test_a_model_is_learned_once_and_a_killed_run_ends_in_the_same(
 
 
 def test_a_set_that_is_not_there_or_not_finished_is_one_line(folder: Path, tmp_path: Path):
-    with pytest.raises(
-        InputError, match="expected the output of 'synth-styles', found none; run: capture4d synth-drap"
-    ):
+    with pytest.raises(InputError, match="expected the output of 'synth-styles', found none; run: capture4d"):
         stage.run(tmp_path / "none", tmp_path / "model", CONFIG)
     assert not (tmp_path / "model").exists()
     record = json.loads((folder / "stage.json").read_text())
