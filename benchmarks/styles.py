@@ -24,6 +24,7 @@ from rich.console import Console
 from benchmarks.metric import Metric
 from capture4d.cache import user_cache_folder
 from capture4d.captures.drapes.style_sets import read_style_set
+from data_synth.drapes.stage import SCHEMA as DRAPES_SCHEMA
 from data_synth.styles.config import STYLE_SETS, StyleSetConfig
 from data_synth.styles.stage import SCHEMA
 from data_synth.styles.stage import run as make_styles
@@ -46,7 +47,7 @@ def run(
         quick: `tiny-styles`, half a minute of drapes, in place of `tshirt-styles`.
         seeds: of the drapes; errors are means over all of them. None: two sets with `--quick`, else one.
         paper: learn the recipe of `--preset paper` as well, with its large networks.
-        fresh: make the drapes anew, though they are in the cache folder.
+        fresh: make the drapes anew, though they are in the cache folder: as after a change of the solver.
     """
     base = STYLE_SETS["tiny-styles" if quick else "tshirt-styles"]
     errors: dict[str, list[Mapping[Part, PartErrors]]] = {}
@@ -68,7 +69,7 @@ def run(
 
 def _drapes(config: StyleSetConfig, *, fresh: bool, workers: int) -> Path:
     """A style set in the cache folder, made if this machine has not done so before."""
-    key = hashlib.sha256(json.dumps([SCHEMA, asdict(config)], sort_keys=True).encode()).hexdigest()[:12]
+    key = hashlib.sha256(json.dumps([SCHEMA, DRAPES_SCHEMA, asdict(config)], sort_keys=True).encode()).hexdigest()[:12]
     folder = user_cache_folder() / "takes" / f"{config.garment}-styles-{key}"
     make_styles(folder, config, workers=workers, overwrite=fresh)
     return folder
