@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.reader_values import MESH, NAMES, PARENTS, RNG
+from benchmarks.reader_values import BODY, GARMENT, MESH, NAMES, PARENTS, RNG
 
 __all__ = ["MODELS"]
 
@@ -132,6 +132,36 @@ def _read_offsets(path: Path) -> Any:
     return load_offset_model(path)
 
 
+def _write_styles(path: Path, *, method: str) -> None:
+    """A model's folder; garment and body lie beside what is damaged."""
+    from capture4d.captures.drapes.style_sets import Ranges
+    from retarget.mixture.config import NetworkConfig
+    from retarget.mixture.heads import Head, PoseNumbers
+    from retarget.mixture.kernel_ridge import KernelRidge
+    from retarget.mixture.model_files import save_styled_garment
+    from retarget.mixture.predictors import Ensemble, Mixture
+    from retarget.mixture.styled_garment import Canonical, StyledGarment
+    from retarget.mixture.training import made_network
+
+    count, config = 3 * len(MESH.vertices), NetworkConfig(hidden=2)
+    pose = PoseNumbers((1,), "axis-angle", np.zeros(3), np.ones(3))
+    canonical = Canonical(KernelRidge(RNG.random((2, 2)), RNG.random((2, count)), 1.0, 0.5), np.zeros((count // 3, 3)))
+    head = Head(np.zeros(count), RNG.random((2, count)), 0.1)
+    kernels = KernelRidge(RNG.random((3, 5)), RNG.random((3, 2)), 1.0, 0.0)
+    ensemble = Ensemble(head, [made_network(5, 2, config)], kernels, 2.0)
+    mixture = Mixture(head, made_network(5, 2, config), head, [made_network(3, 2, config)],
+                      RNG.random((1, count // 3, 3)), 0.01, True)  # fmt: skip
+    ranges = Ranges({"length": (0.4, 0.8)}, [(-1.0, 1.0)])
+    predictor = ensemble if method == "ensemble" else mixture
+    save_styled_garment(path.parent, StyledGarment(GARMENT, BODY, ranges, pose, canonical, predictor, True))
+
+
+def _read_styles(path: Path) -> Any:
+    from retarget.mixture.model_files import load_styled_garment
+
+    return load_styled_garment(path.parent)
+
+
 MODELS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any]]] = {
     "linear": (_write_linear, _read_linear),
     "kernel": (_write_kernel, _read_kernel),
@@ -140,5 +170,7 @@ MODELS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any]]] = {
     "generator": (_write_generator, _read_generator),
     "decoder": (partial(_write_offsets, baseline=False), _read_offsets),
     "pca": (partial(_write_offsets, baseline=True), _read_offsets),
+    "ensemble/styles": (partial(_write_styles, method="ensemble"), _read_styles),
+    "mixture/styles": (partial(_write_styles, method="mixture"), _read_styles),
 }
 """How a file of each is written, and read."""

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from capture4d.motions.motion_files import write_motion as write_motion
     from capture4d.one_shot import load_garment_model as load_garment_model
     from capture4d.one_shot import load_registered as load_registered
+    from capture4d.one_shot import load_styled_garment as load_styled_garment
     from capture4d.one_shot import register_mesh as register_mesh
     from capture4d.one_shot import wrinkle_map as wrinkle_map
     from capture4d.runs.cluster.scheduler import use_scheduler as use_scheduler
@@ -69,7 +70,7 @@ _HOMES = {
     "capture4d.errors": "InputError StaleError",
     "capture4d.mesh_files.meshes": "read_coloured_mesh read_mesh write_mesh",
     "capture4d.files.records": "load_body load_garment load_poses load_rig save_body save_garment save_poses save_rig",
-    "capture4d.one_shot": "load_garment_model load_registered register_mesh wrinkle_map",
+    "capture4d.one_shot": "load_garment_model load_registered load_styled_garment register_mesh wrinkle_map",
     "capture4d.runs.cluster.scheduler": "use_scheduler",
     "capture4d.runs.stage": "StageResult",
     "capture4d.types": "BlendshapeModel Body Garment GarmentScan Mesh PoseSequence RegisteredSequence Rig Scan",

@@ -20,8 +20,9 @@ from registration.register_mesh import register_mesh as register_normalised
 
 if TYPE_CHECKING:
     from retarget.animation.garment_model import GarmentModel
+    from retarget.mixture.styled_garment import StyledGarment
 
-__all__ = ["as_mesh", "load_garment_model", "load_registered", "register_mesh", "wrinkle_map"]
+__all__ = ["as_mesh", "load_garment_model", "load_registered", "load_styled_garment", "register_mesh", "wrinkle_map"]
 
 
 def register_mesh(
@@ -76,6 +77,19 @@ def load_garment_model(path: str | Path, *, device: str = "cpu") -> "GarmentMode
     from retarget.animation.garment_model import load_garment_model as load
 
     return load(path, device=device)
+
+
+def load_styled_garment(path: str | Path) -> "StyledGarment":
+    """What `fit-styles` wrote, ready to be worn: `.vertices(poses, beta, style)` is the garment of a style on a person.
+
+    Args:
+        path: the model's folder.
+    Raises:
+        InputError: a file is missing, damaged, or belongs to another model.
+    """
+    from retarget.mixture.model_files import load_styled_garment as load
+
+    return load(Path(path))
 
 
 def wrinkle_map(model: str | Path, vertices: Any, *, template: Garment | None = None) -> np.ndarray:

@@ -1,4 +1,5 @@
-"""Captures that nobody filmed, as functions by the names of their commands; `capture4d.pipeline` hands them on."""
+"""Captures and drapes that nobody filmed, and what drapes teach, as functions by the names of their commands;
+`capture4d.pipeline` hands them on."""
 
 from __future__ import annotations
 
@@ -11,8 +12,10 @@ from capture4d.runs.stage import StageResult
 from data_synth.config import PRESETS, TRAINING_SETS, BoardConfig, SynthConfig, TrainingSetConfig
 from data_synth.drapes.config import DrapesConfig
 from data_synth.scanner.config import ScanConfig
+from data_synth.styles.config import STYLE_SETS, StyleSetConfig
+from retarget.mixture.config import StylesConfig
 
-__all__ = ["scan", "synth", "synth_board", "synth_drapes"]
+__all__ = ["fit_styles", "scan", "synth", "synth_board", "synth_drapes"]
 
 Place: TypeAlias = str | Path
 
@@ -76,13 +79,47 @@ def synth_board(
 
 @logged_stage("synth-drapes")
 def synth_drapes(
-    output: Place, config: DrapesConfig | None = None, *, workers: int = 1, overwrite: bool = False
+    output: Place,
+    config: DrapesConfig | StyleSetConfig | str | None = None,
+    *,
+    workers: int = 1,
+    overwrite: bool = False,
 ) -> StageResult:
     """Drape a garment over a still body in many poses, to learn from; `failed` are the drapes that are not fit for it.
 
+    Args:
+        config: of one style on one person; or name or settings of a style set, such as "tiny-styles".
     Raises:
-        InputError: the style or the shape is none, or the folder holds something else.
+        InputError: the style, the shape or the preset is none, or the folder holds something else.
     """
     from data_synth.drapes.stage import run as stage
+    from data_synth.styles.stage import run as style_set
+
+    if isinstance(config, str):
+        if config not in STYLE_SETS:
+            raise InputError(f"config: expected one of {', '.join(STYLE_SETS)}, found '{config}'")
+        config = STYLE_SETS[config]
+    if isinstance(config, StyleSetConfig):
+        return style_set(Path(output), config, workers=workers, overwrite=overwrite)
 
     return stage(Path(output), config or DrapesConfig(), workers=workers, overwrite=overwrite)
+
+
+@logged_stage("fit-styles")
+def fit_styles(
+    styles: Place,
+    output: Place,
+    config: StylesConfig | None = None,
+    *,
+    workers: int = 1,
+    overwrite: bool = False,
+) -> StageResult:
+    """Learn a garment in all its styles from a style set: a function of pose, shape and style.
+
+    Args:
+        styles: what `synth_drapes` wrote of a style set.
+        workers: torch's threads; the last bits of a network depend on their number.
+    """
+    from retarget.mixture.stage import run as stage
+
+    return stage(Path(styles), Path(output), config or StylesConfig(), workers=workers, overwrite=overwrite)

@@ -23,7 +23,8 @@ _GROUPS: Mapping[str, Sequence[str]] = {
         "run", "check", "template", "extract", "track", "register", "report", "status", "diff",
     ),
     "learn and animate:": (
-        "fit", "animate", "wrinkles maps", "wrinkles train", "wrinkles apply", "wrinkles offsets", "compare",
+        "fit", "fit-styles", "animate", "wrinkles maps", "wrinkles train", "wrinkles apply", "wrinkles offsets",
+        "compare",
     ),
     "out to other tools, and back:": ("export", "import", "score"),
     "two meshes:": ("register-mesh",),
@@ -44,6 +45,7 @@ EXAMPLES: Mapping[str, Sequence[str]] = {
     "synth-drapes": (
         "synth-drapes drapes --garment tshirt --samples 1000",
         "synth-drapes skirts --garment skirt --style length_m=0.6 flare=1.8 --beta 1.0 -0.5",
+        "synth-drapes styles --preset tiny-styles",
     ),
     "check": ("check capture", "check scans --fps 60 --units mm --garment-colour '#2f62c9' --fix"),
     "template": (
@@ -62,6 +64,7 @@ EXAMPLES: Mapping[str, Sequence[str]] = {
     "status": ("status work", "status work --json"),
     "diff": ("diff before after", "diff before after --fail-if-worse fit_mean_mm=5"),
     "fit": ("fit work", "fit walk run jump --output shirt"),
+    "fit-styles": ("fit-styles styles --output model", "fit-styles styles --output model --preset paper"),
     "animate": ("animate work --poses motion.bvh --output dance --beta 1.5 2.0",),
     "wrinkles maps": ("wrinkles maps work",),
     "wrinkles train": ("wrinkles train work --output model",),

@@ -23,7 +23,7 @@ from capture4d.cli.commands.doctor import Doctor
 from capture4d.cli.commands.exchange import Export, Import, Score
 from capture4d.cli.commands.files import ConvertBody, ConvertPoses, ConvertRig, RegisterMesh, Template
 from capture4d.cli.commands.folders import Diff, Status
-from capture4d.cli.commands.models import Animate, Fit
+from capture4d.cli.commands.models import Animate, Fit, FitStyles
 from capture4d.cli.commands.stages import Extract, Register, Report, Run, Track
 from capture4d.cli.commands.synthesis import Demo, Scan, Synth, SynthBoard, SynthDrapes
 from capture4d.cli.commands.wrinkles import Compare, WrinklesApply, WrinklesMaps, WrinklesOffsets, WrinklesTrain
@@ -34,6 +34,7 @@ from capture4d.cli.parsing import command_options, parse
 from capture4d.runs.address_space import require_address_space
 from data_synth import config as synth_config
 from registration import config as registration_config
+from retarget.mixture import config as mixture_config
 from wrinkles.normal_maps import config as wrinkle_config
 
 __all__ = ["COMMANDS", "main"]
@@ -57,6 +58,7 @@ COMMANDS: Mapping[str, Any] = {
     "status": Status,
     "diff": Diff,
     "fit": Fit,
+    "fit-styles": FitStyles,
     "animate": Animate,
     "wrinkles maps": WrinklesMaps,
     "wrinkles train": WrinklesTrain,
@@ -84,6 +86,7 @@ _PRESETS: Mapping[Any, Mapping[str, Any]] = {
     Register: registration_config.PRESETS,
     Run: registration_config.PRESETS,
     WrinklesTrain: wrinkle_config.PRESETS,
+    FitStyles: mixture_config.PRESETS,
 }
 
 

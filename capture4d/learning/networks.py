@@ -38,8 +38,7 @@ class ImageDecoder(nn.Module):
         return self.mean + self.layers(known[:, :, None, None])
 
 
-def perceptron(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
-    """Two hidden layers of the same width."""
-    return nn.Sequential(
-        nn.Linear(inputs, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, outputs)
-    )
+def perceptron(inputs: int, hidden: int, outputs: int, *, dropout: float = 0.0) -> nn.Sequential:
+    """Two hidden layers of the same width; with dropout, a layer of it after the first."""
+    first: list[nn.Module] = [nn.Linear(inputs, hidden), nn.ReLU(), *([nn.Dropout(dropout)] if dropout else [])]
+    return nn.Sequential(*first, nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, outputs))

@@ -1,11 +1,11 @@
-"""`capture4d fit` and `animate`: the garment as a model."""
+"""`capture4d fit`, `animate` and `fit-styles`: the garment as a model."""
 
 from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
@@ -15,8 +15,9 @@ from capture4d.cli.verdict import say_verdict
 from capture4d.errors import CommandLineError
 from capture4d.settings import Number
 from retarget.config import AnimateConfig, FitConfig
+from retarget.mixture import config as mixture_config
 
-__all__ = ["Animate", "Fit"]
+__all__ = ["Animate", "Fit", "FitStyles"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,3 +90,28 @@ class Animate(GradedOptions):
             first = f"frame {doubtful[0]['frame_id']}: {'; '.join(doubtful[0]['reasons'])}"
             print(f"capture4d: {len(doubtful)} of {result.frames} frames are to be checked; {first}", file=sys.stderr)
         return self.graded(result)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitStyles(StageOptions):
+    """Learn a garment in all its styles, on everybody and in every pose, from a style set of drapes."""
+
+    styles: Annotated[Positional[Path], arg(metavar="STYLES")]
+    """What `synth-drapes --preset` wrote."""
+    output: Path
+    """Folder of the model."""
+    preset: Literal[*mixture_config.PRESETS] = "default"
+    """What the settings below start from; `paper` is TailorNet's recipe, 330 million parameters at its size."""
+    config: Annotated[mixture_config.StylesConfig, arg(name="")] = field(default_factory=mixture_config.StylesConfig)
+
+    def __call__(self) -> int:
+        from capture4d import pipeline
+        from capture4d.files.atomic import read_json
+
+        result = pipeline.fit_styles(
+            self.styles, self.output, self.config, workers=self.workers, overwrite=self.overwrite
+        )
+        for part, errors in read_json(result.path / "errors.json")["errors"].items():
+            print(f"{part}: {errors['vertex_mm']:.1f} mm, {errors['normal_deg']:.1f} deg, {errors['drapes']} drapes")
+        print(f"model: {result.path}")
+        return GOOD

@@ -17,6 +17,7 @@ from capture4d.settings import Percent
 from data_synth import config as synth_config
 from data_synth.drapes.config import DrapesConfig
 from data_synth.scanner.config import ScanConfig
+from data_synth.styles.config import STYLE_SETS
 
 __all__ = ["Demo", "Scan", "Synth", "SynthBoard", "SynthDrapes"]
 
@@ -118,12 +119,20 @@ class SynthDrapes(StageOptions):
     """Folder to write."""
     max_pruned: Percent = 50.0
     """Percent of drapes that may be unfit to learn from; more of them end in exit code 3."""
+    preset: Literal["one-style", *STYLE_SETS] = "one-style"
+    """A set of one style on one person, as the settings below have it; or a style set, of many, which has no other
+    settings."""
     config: Annotated[DrapesConfig, arg(name="")] = field(default_factory=DrapesConfig)
 
     def __call__(self) -> int:
         from capture4d import pipeline
 
-        result = pipeline.synth_drapes(self.output, self.config, workers=self.workers, overwrite=self.overwrite)
+        chosen = STYLE_SETS.get(self.preset)
+        if chosen is not None and self.config != DrapesConfig():
+            raise InputError(f"--preset {self.preset}: expected no other settings, for its pairs bring their own")
+        result = pipeline.synth_drapes(
+            self.output, chosen or self.config, workers=self.workers, overwrite=self.overwrite
+        )
         kept = result.frames - len(result.failed)
         print(f"drapes: {result.path}, {kept} of {result.frames} fit to learn from")
         broken = result.failed_percent > self.max_pruned
