@@ -47,6 +47,7 @@ EXAMPLES: Mapping[str, Sequence[str]] = {
     "check": ("check capture", "check scans --fps 60 --units mm --garment-colour '#2f62c9' --fix"),
     "template": (
         "template shirt.obj --units cm --output capture/template.npz",
+        "template shirt.obj --wrap --cage panels.npy --output capture/template.npz",
         "template --region tshirt --output capture/template.npz",
     ),
     "extract": ("extract capture --output work",),
