@@ -18,6 +18,9 @@ FOLD_RATIO = 150.0
 """How much better the anisotropic bases conduct along y than along x."""
 SINE_PERIODS, SINE_HEIGHT = 4, 0.05
 LEAN = 1.5
+BUMPS = {"bump": 0.15, "two_bumps": 0.08}
+"""Heights."""
+DEMOS = (*BUMPS, "sine", "wave")
 
 
 @dataclass(frozen=True)
@@ -69,9 +72,9 @@ def boundary(name: str, points: np.ndarray) -> np.ndarray:
     on_low, on_sides = y == 0, (y == 0) | (y == 1)
     match name:
         case "bump":
-            moved[on_low, 2] = 0.15 * np.exp(-(((x[on_low] - 0.5) / 0.07) ** 2))
+            moved[on_low, 2] = BUMPS["bump"] * np.exp(-(((x[on_low] - 0.5) / 0.07) ** 2))
         case "two_bumps":
-            moved[on_sides, 2] = 0.08 * np.exp(-(((x[on_sides] - 0.5) / 0.05) ** 2))
+            moved[on_sides, 2] = BUMPS["two_bumps"] * np.exp(-(((x[on_sides] - 0.5) / 0.05) ** 2))
         case "sine":
             moved[on_sides, 2] = SINE_HEIGHT * np.sin(2 * np.pi * SINE_PERIODS * x[on_sides])
         case "wave":
@@ -80,9 +83,6 @@ def boundary(name: str, points: np.ndarray) -> np.ndarray:
         case _:
             raise ValueError(name)
     return moved
-
-
-DEMOS = ("bump", "two_bumps", "sine", "wave")
 
 
 def sine_exact(points: np.ndarray, ratio: float) -> np.ndarray:

@@ -14,7 +14,7 @@ from capture4d.body.skinning import PosedBody, with_pose, with_shape
 from capture4d.cli.main import main
 from capture4d.errors import InputError
 from capture4d.files.records import load_garment
-from capture4d.geometry.mesh import vertex_normals
+from capture4d.geometry.mesh import edge_lengths, unique_edges, vertex_normals
 from capture4d.mesh_files.meshes import write_mesh
 from capture4d.templates.body_regions import body_region
 from capture4d.templates.cage_files import read_cage
@@ -48,18 +48,23 @@ def on_body(garment: Garment, body: PosedBody) -> np.ndarray:
     return np.einsum("vk,vkc->vc", garment.embedding_barycentric, corners)
 
 
-def test_cloth_comes_back_to_the_skin_it_was_lifted_from(body: PosedBody, skin: Mesh) -> None:
-    """And nearer to it than by nearest points, of which folds share some and skip others."""
-    cloth = worn(skin, 0.02)
-    errors = {}
+def test_cloth_comes_back_to_the_skin_it_was_lifted_from(body: PosedBody) -> None:
+    """Without the crowds and gaps of nearest points, which are exact elsewhere: cloth was lifted along the normals."""
+    skin = body_region(body.shaped, "tshirt")
+    edges = unique_edges(skin.faces)
+    lengths = edge_lengths(skin.vertices.astype(float), edges)
+    worst_mm, spread = {}, {}
     for wrap in (False, True):
-        garment, report = make_template(cloth, body, uv="none", wrap=wrap)
-        errors[wrap] = 1e3 * np.linalg.norm(on_body(garment, body) - skin.vertices, axis=1)
+        garment, report = make_template(worn(skin, 0.02), body, uv="none", wrap=wrap)
+        places = on_body(garment, body)
+        worst_mm[wrap] = 1e3 * np.linalg.norm(places - skin.vertices, axis=1).max()
+        spread[wrap] = float((edge_lengths(places, edges) / lengths).std())
+    assert worst_mm[True] < 0.5 * worst_mm[False]
+    assert spread[True] < 0.3 * spread[False]
     assert report.wrap is not None
-    assert report.wrap.spread < 0.8 * report.wrap.spread_before
+    assert report.wrap.spread < 0.6 * report.wrap.spread_before
     assert report.wrap.flipped_percent < 1.5
-    assert report.wrap.cage.patch_count > 3
-    assert errors[True].mean() < 0.9 * errors[False].mean()
+    assert report.wrap.cage.patch_count > 6
 
 
 def test_the_command_takes_labels_and_curves(tmp_path: Path, body: PosedBody, skin: Mesh, capsys) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.cage_demos import FOLD_RATIO, SINE_HEIGHT, Patch, boundary, facing_down_percent, sine_exact
+from benchmarks.cage_demos import BUMPS, FOLD_RATIO, SINE_HEIGHT, Patch, boundary, facing_down_percent, sine_exact
 from capture4d.errors import InputError
 from capture4d.geometry.cages.dirichlet import Extension, conductivity_along, dirichlet_form, flattened
 from tests.shapes import tube
@@ -62,7 +62,7 @@ def test_folds_run_across_the_patch_and_a_leaning_bump_turns_over() -> None:
     patch = Patch.jittered(56, np.random.default_rng(3))
     places = patch.points[patch.border]
     plain, folds = patch.extension(folds=False), patch.extension(folds=True)
-    for demo, side in (("bump", 0.15), ("two_bumps", 0.08)):
+    for demo, side in BUMPS.items():
         middle = [patch.height_at(each(boundary(demo, places)), 0.5, 0.5) / side for each in (plain, folds)]
         assert middle[0] < 0.1
         assert middle[1] > 0.35
