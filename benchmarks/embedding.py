@@ -30,6 +30,7 @@ from benchmarks.cage_demos import (
     facing_down_percent,
     sine_exact,
 )
+from benchmarks.cage_drapes import drapes_by_cage
 from benchmarks.metric import Metric
 from capture4d.app.drawing.render import Drawn, View, frame_view, render
 from capture4d.body.anny import load_anny
@@ -67,10 +68,18 @@ class _Case:
     mesh: Mesh
     body: PosedBody
     is_pattern: bool
+    draper: Draper | None = None
+    """Of a garment that came to rest."""
 
 
 def run(
-    *, quick: bool = False, vertices: int = 3000, seed: int = 0, pictures: Path | None = None, others: Path = OTHERS
+    *,
+    quick: bool = False,
+    vertices: int = 3000,
+    drapes: int = 12,
+    seed: int = 0,
+    pictures: Path | None = None,
+    others: Path = OTHERS,
 ) -> list[Metric]:
     """Wrap garments; carry values into a patch.
 
@@ -78,6 +87,7 @@ def run(
         quick: a third of the vertices, as the panels hang around the body before anything is simulated; rest lengths
             are then those of the hanging panels, not the pattern's.
         vertices: of each garment of ours.
+        drapes: of the T-shirt, of which it is measured what its cage tells; none if quick.
         seed: of the patch's mesh and of the garments'.
         pictures: folder for cage-demos.png and shrink-wrap.png.
         others: folder with the garment from elsewhere.
@@ -89,6 +99,8 @@ def run(
         assert report.wrap is not None
         metrics += _measured(case, garment, report.wrap)
         Console(stderr=True).print(f"{case.name}: {metrics[-3].value:.2f}, {report.wrap.flipped_percent:.1f} % flipped")
+        if case.name == "tshirt" and case.draper is not None and drapes:
+            metrics += drapes_by_cage(case.draper, garment, report.wrap, drapes, seed)
         if pictures is not None:
             rows.append(_pictures(case, report.wrap, _flat(garment)))
     if pictures is not None:
@@ -110,7 +122,7 @@ def _cases(vertices: int, seed: int, others: Path, *, hanging: bool) -> Iterator
         else:
             draper = Draper(DrapesConfig(garment=name, vertices=vertices, garment_seed=seed), body)
             worn = with_pose(draper.person, draper.dressing, np.zeros(3))
-            yield _Case(name, _mesh(draper.dressed, draper.mesh), worn, is_pattern=True)
+            yield _Case(name, _mesh(draper.dressed, draper.mesh), worn, True, draper)
     path = others / f"{OTHER}.obj"
     if path.is_file():
         mesh = read_mesh(path).mesh

@@ -14,6 +14,7 @@ from capture4d.body.skinning import PosedBody, with_pose, with_shape
 from capture4d.cli.main import main
 from capture4d.errors import InputError
 from capture4d.files.records import load_garment
+from capture4d.geometry.cages.cage import cage_of_curves, cage_of_labels
 from capture4d.geometry.mesh import edge_lengths, unique_edges, vertex_normals
 from capture4d.mesh_files.meshes import write_mesh
 from capture4d.templates.body_regions import body_region
@@ -77,7 +78,9 @@ def test_the_command_takes_labels_and_curves(tmp_path: Path, body: PosedBody, sk
     curve = front[np.argsort(cloth.vertices[front, 1])][[0, -1]].tolist()
     (tmp_path / "middle.json").write_text(json.dumps({"curves": [curve]}))
     found = []
-    for cage, patches in (("sides.npy", 2), ("middle.json", 1)):
+    by_labels = cage_of_labels(cloth.faces, left.astype(np.uint8))
+    by_curve = cage_of_curves(cloth.vertices, cloth.faces, [np.array(curve)])
+    for cage, patches in (("sides.npy", by_labels.patch_count), ("middle.json", by_curve.patch_count)):
         options = ["--wrap", "--cage", str(tmp_path / cage), "--uv", "none", "--overwrite", "--output", str(output)]
         with pytest.raises(SystemExit) as ended:
             main(["template", mesh, *options])
