@@ -64,6 +64,7 @@ from capture4d.mesh_files.meshes import read_coloured_mesh, read_mesh, write_mes
 from capture4d.motions.bvh import Bvh, format_bvh, moved_by_root
 from capture4d.motions.motion_files import read_motion, write_amass, write_bvh
 from capture4d.runs.stage import open_stage, require_complete
+from capture4d.templates.cage_files import read_cage
 from capture4d.types import GarmentScan
 from data_synth.mesh_sequence import open_sequence
 from retarget.shapes.files import load_blendshapes, save_blendshapes
@@ -291,6 +292,8 @@ KINDS = [
     Kind("sequence.npz", lambda path: write_npz(path, vertices=RNG.random((2, 6, 3)), faces=MESH.faces),
          _read_sequence),
     Kind("vertices.npy", lambda path: write_npy(path, RNG.random((4, 6, 3), np.float32)), map_array),
+    Kind("labels.npy", lambda path: write_npy(path, RNG.integers(0, 9, 12)), read_cage),
+    Kind("cage.json", lambda path: write_json(path, {"curves": [[0, 3, 5], [1, 2]]}), read_cage),
     Kind("map.png", _normal_map, read_map),
     Kind("board.png", _board_image, _detect),
     Kind("registration/frames/000001.npz", _registration, _read_registration, names_other=True),

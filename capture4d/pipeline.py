@@ -267,6 +267,7 @@ def template(
     *,
     body: Place | None = None,
     poses: Place | None = None,
+    cage: Place | None = None,
     overwrite: bool = False,
 ) -> TemplateResult:
     """Make a template of a garment mesh, or of a part of the body: bound, its borders named, its UVs checked.
@@ -275,14 +276,17 @@ def template(
         mesh: garment that lies on the body; None where `config` names a region of the body.
         body: the body it lies on, a body.npz; the built-in one if None.
         poses: motion file with the pose and the shape in which it lies there; the rest pose if None.
+        cage: curves along which `config.wrap` shrinks the mesh onto the body, .npy or .json; found if None.
         overwrite: write it over a file that holds something else.
     """
     from capture4d.files.outputs import new_files
     from capture4d.templates.stage import run as stage
 
-    given, place, config = [_maybe(path) for path in (mesh, body, poses)], Path(output), config or TemplateConfig()
+    given, place = [_maybe(path) for path in (mesh, body, poses, cage)], Path(output)
     with new_files([place], inputs=given, overwrite=overwrite) as workshop:
-        result = stage(given[0], workshop / place.name, config, body=given[1], poses=given[2])
+        result = stage(
+            given[0], workshop / place.name, config or TemplateConfig(), body=given[1], poses=given[2], cage=given[3]
+        )
     return replace(result, path=place)
 
 

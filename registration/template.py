@@ -11,7 +11,7 @@ from jaxtyping import Float64, Int32
 from capture4d.body.sewing_pattern import with_known_pattern
 from capture4d.captures.names import unknown_borders
 from capture4d.errors import InputError
-from capture4d.geometry.mesh import doubled_area_vectors, edge_uses, edges_of_faces, normalised, unique_edges
+from capture4d.geometry.mesh import doubled_area_vectors, edge_uses, flat_edge_lengths, normalised, unique_edges
 from capture4d.types import Garment
 from registration.cloth_colours import ClothColours
 from registration.config import RegistrationConfig
@@ -146,10 +146,7 @@ def rest_lengths(garment: Garment, edges: Int32[np.ndarray, "edges 2"]) -> Float
     vertices, faces, uv = garment.template.vertices.astype(np.float64), garment.template.faces, garment.template.uv
     if uv is None or not garment.pattern_metres:
         return np.linalg.norm(vertices[edges[:, 1]] - vertices[edges[:, 0]], axis=1)
-    sides = uv.astype(np.float64)
-    lengths = garment.pattern_metres * np.linalg.norm(sides - sides[:, [1, 2, 0]], axis=2).reshape(-1)
-    edge_of = edges_of_faces(faces, edges).reshape(-1)
-    return np.bincount(edge_of, lengths) / np.bincount(edge_of)
+    return garment.pattern_metres * flat_edge_lengths(uv, faces, edges)
 
 
 def _border(garment: Garment) -> Border:

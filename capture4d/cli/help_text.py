@@ -24,7 +24,7 @@ _GROUPS: Mapping[str, Sequence[str]] = {
     ),
     "learn and animate:": (
         "fit", "fit-styles", "animate", "wrinkles maps", "wrinkles train", "wrinkles apply", "wrinkles offsets",
-        "compare",
+        "compare", "offsets draw", "offsets edit", "offsets apply",
     ),
     "out to other tools, and back:": ("export", "import", "score"),
     "two meshes:": ("register-mesh",),
@@ -50,6 +50,7 @@ EXAMPLES: Mapping[str, Sequence[str]] = {
     "check": ("check capture", "check scans --fps 60 --units mm --garment-colour '#2f62c9' --fix"),
     "template": (
         "template shirt.obj --units cm --output capture/template.npz",
+        "template shirt.obj --wrap --cage panels.npy --output capture/template.npz",
         "template --region tshirt --output capture/template.npz",
     ),
     "extract": ("extract capture --output work",),
@@ -70,6 +71,9 @@ EXAMPLES: Mapping[str, Sequence[str]] = {
     "wrinkles train": ("wrinkles train work --output model",),
     "wrinkles apply": ("wrinkles apply model work --bits 8 --flip-green",),
     "wrinkles offsets": ("wrinkles offsets work",),
+    "offsets draw": ("offsets draw work --frame 12 --output pictures",),
+    "offsets edit": ("offsets edit pictures operations.json work --output edited",),
+    "offsets apply": ("offsets apply edited work --output edited.ply",),
     "compare": ("compare work --model model",),
     "export": ("export work", "export dance --format glb --format abc --frames 1-200"),
     "import": ("import edited.abc --template work/registration/garment.npz --output edited",),

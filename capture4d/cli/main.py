@@ -24,6 +24,7 @@ from capture4d.cli.commands.exchange import Export, Import, Score
 from capture4d.cli.commands.files import ConvertBody, ConvertPoses, ConvertRig, RegisterMesh, Template
 from capture4d.cli.commands.folders import Diff, Status
 from capture4d.cli.commands.models import Animate, Fit, FitStyles
+from capture4d.cli.commands.offsets import OffsetsApply, OffsetsDraw, OffsetsEdit
 from capture4d.cli.commands.stages import Extract, Register, Report, Run, Track
 from capture4d.cli.commands.synthesis import Demo, Scan, Synth, SynthBoard, SynthDrapes
 from capture4d.cli.commands.wrinkles import Compare, WrinklesApply, WrinklesMaps, WrinklesOffsets, WrinklesTrain
@@ -64,6 +65,9 @@ COMMANDS: Mapping[str, Any] = {
     "wrinkles train": WrinklesTrain,
     "wrinkles apply": WrinklesApply,
     "wrinkles offsets": WrinklesOffsets,
+    "offsets draw": OffsetsDraw,
+    "offsets edit": OffsetsEdit,
+    "offsets apply": OffsetsApply,
     "compare": Compare,
     "export": Export,
     "import": Import,
@@ -77,7 +81,8 @@ COMMANDS: Mapping[str, Any] = {
     "doctor": Doctor,
 }
 
-_WRITE_FILES = (Check, Template, RegisterMesh, Calibrate, ConvertBody, ConvertPoses, ConvertRig, Diff)
+_WRITE_FILES = (Check, Template, RegisterMesh, Calibrate, ConvertBody, ConvertPoses, ConvertRig, Diff,
+                OffsetsDraw, OffsetsEdit, OffsetsApply)  # fmt: skip
 """Commands whose output is a file among others, or a folder that comes to be at the end; that of the rest is a folder
 of their own."""
 

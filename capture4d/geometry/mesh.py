@@ -24,6 +24,7 @@ __all__ = [
     "edge_uses",
     "edges_of_faces",
     "face_areas",
+    "flat_edge_lengths",
     "half_edges",
     "normalised",
     "stretch_p99",
@@ -134,6 +135,21 @@ def edges_of_faces(faces: Integer[np.ndarray, "F 3"], edges: Integer[np.ndarray,
         edges: of these faces, as `unique_edges` returns them.
     """
     return np.searchsorted(_edge_keys(edges), _edge_keys(half_edges(faces))).reshape(-1, 3)
+
+
+def flat_edge_lengths(
+    flat: Float[np.ndarray, "F 3 2"], faces: Integer[np.ndarray, "F 3"], edges: Integer[np.ndarray, "E 2"]
+) -> Float64[np.ndarray, " E"]:
+    """Lengths on a pattern, in its unit; the mean of both sides where two panels are sewn together.
+
+    Args:
+        flat: the faces' corners on it.
+        edges: of these faces, as `unique_edges` returns them.
+    """
+    corners = flat.astype(np.float64)
+    lengths = np.linalg.norm(corners - corners[:, [1, 2, 0]], axis=2).reshape(-1)
+    edge_of = edges_of_faces(faces, edges).reshape(-1)
+    return np.bincount(edge_of, lengths) / np.bincount(edge_of)
 
 
 def boundary_edges(faces: Integer[np.ndarray, "F 3"]) -> Int32[np.ndarray, "B 2"]:

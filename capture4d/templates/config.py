@@ -33,6 +33,8 @@ class TemplateConfig:
     """Axis of the mesh that points up; found by how it lies on the body if None."""
     uv_is_pattern: bool = False
     """The mesh's UVs are its sewing pattern, whatever they look like."""
+    wrap: bool = False
+    """Bind the mesh to where it comes to lie when it is shrunk onto the body, instead of to its nearest body points."""
 
 
 TEMPLATE = TemplateConfig()

@@ -9,21 +9,23 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32
 
 from capture4d.body.binding import WEIGHT_SMOOTHING, diffuse
-from capture4d.body.posed_surface import PosedSurface, match, tracked_body
+from capture4d.body.posed_surface import Matches, PosedSurface, match, tracked_body
 from capture4d.body.sewing_pattern import PatternFit, as_pattern, fit_pattern
 from capture4d.body.skinning import PosedBody, unskin
 from capture4d.captures.names import require_plain_names
 from capture4d.errors import InputError
+from capture4d.geometry.cages.dirichlet import flattened
 from capture4d.geometry.mesh import boundary_loops, edge_uses, half_edges, vertex_normals
 from capture4d.geometry.seams import welded_mesh
 from capture4d.geometry.uv_atlas import UvReport, check_uv, fresh_uv
 from capture4d.templates.config import UvChoice
+from capture4d.templates.wrapping import CageMarks, Wrap, found_cage, wrap_garment
 from capture4d.types import Body, Garment, Mesh
 
 __all__ = ["TemplateReport", "make_template", "name_loops"]
@@ -52,6 +54,8 @@ class TemplateReport:
     fresh_uv: bool
     pattern: PatternFit | None = None
     """How the UVs that were kept compare with a sewing pattern; None where none were kept."""
+    wrap: Wrap | None = None
+    """How the mesh lies shrunk onto the body; None where its vertices are bound to their nearest body points."""
 
 
 def make_template(
@@ -61,6 +65,8 @@ def make_template(
     uv: UvChoice = "auto",
     uv_is_pattern: bool = False,
     names: Sequence[str] = (),
+    wrap: bool = False,
+    cage: CageMarks | None = None,
     source: str = "mesh",
 ) -> tuple[Garment, TemplateReport]:
     """Bind a mesh to the body it lies on, and take it to the rest pose.
@@ -71,6 +77,8 @@ def make_template(
         uv: keep the mesh's, cut `fresh` ones, have `none`; `auto` keeps them if nothing is wrong with them.
         uv_is_pattern: the UVs are the sewing pattern, whatever they look like; else they are compared with one.
         names: of the loops, the one with the most vertices first; found by position if empty.
+        wrap: bind each vertex to where it comes to lie when the mesh is shrunk onto the body, not to its nearest point.
+        cage: along which it is shrunk, marked on the mesh as it came; found if None.
         source: what errors call the mesh.
     Raises:
         InputError: the mesh cannot be a template; says what was expected.
@@ -80,57 +88,90 @@ def make_template(
     size = float(np.ptp(mesh.vertices, axis=0).max())
     if size < LEAST_SIZE_M:
         raise InputError(f"expected a garment, found a mesh of {1e3 * size:.2g} mm; its units differ", where=source)
-    at, barycentric, weights, nearest = _bind(mesh, body)
-    distance = float(np.median(np.linalg.norm(mesh.vertices - nearest, axis=1)))
+    binding = _Binding.to_nearest(mesh, body)
+    distance = float(np.median(np.linalg.norm(mesh.vertices - binding.nearest.points, axis=1)))
     if distance > FAR_M:
         raise InputError(
             f"expected a garment on the body, found it {1e3 * distance:.0f} mm off in the median; "
             "its units, its place or the pose differ",
             where=source,
         )
-    rest, flagged = unskin(mesh.vertices, weights, body.transforms)
-    if flagged.any():
-        raise InputError(
-            f"expected a pose that can be undone, found {flagged.sum()} vertices between limbs", where=source
-        )
-    loops = boundary_loops(mesh.faces)
     found = check_uv(mesh)
     if uv_is_pattern and uv in ("fresh", "none"):
         raise InputError(f"expected UVs that are kept, being the pattern; found --uv {uv}", where=source)
     kept, fresh = (mesh.uv, False) if uv_is_pattern else _choose_uv(mesh, found, uv, source)
     own = fresh or (kept is None and not uv_is_pattern)
     metres, pattern = _pattern(mesh, source, own=own, told=uv_is_pattern)
+    wrapped = None
+    if wrap:
+        panels = None if own else kept
+        marked = found_cage(mesh, binding.weights, panels) if cage is None else cage.on(mesh, welded.of_vertex)
+        flat = metres * kept.astype(np.float64) if metres and kept is not None else flattened(mesh.vertices, mesh.faces)
+        wrapped = wrap_garment(mesh, binding.surface, binding.normals, binding.nearest.points, cage=marked, flat=flat)
+        binding = binding.moved_to(mesh, wrapped.placed.faces, wrapped.placed.barycentric)
+    weights = binding.weights
+    rest, flagged = unskin(mesh.vertices, weights, body.transforms)
+    if flagged.any():
+        raise InputError(
+            f"expected a pose that can be undone, found {flagged.sum()} vertices between limbs", where=source
+        )
+    loops = boundary_loops(mesh.faces)
     garment = Garment(
         template=Mesh(rest.astype(np.float32), mesh.faces, kept),
         loops=dict(zip(_loop_names(loops, names, weights, rest, body.shaped.body, source), loops, strict=True)),
-        embedding_faces=at,
-        embedding_barycentric=barycentric,
+        embedding_faces=binding.faces,
+        embedding_barycentric=binding.barycentric.astype(np.float32),
         skin_weights=weights,
         body_shape=np.asarray(body.shaped.shape, np.float32),
         pattern_metres=metres,
     )
-    return garment, TemplateReport(len(mesh.vertices), len(mesh.faces), distance, found, fresh, pattern)
+    return garment, TemplateReport(len(mesh.vertices), len(mesh.faces), distance, found, fresh, pattern, wrapped)
 
 
-def _bind(mesh: Mesh, body: PosedBody) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Body faces and barycentrics, skin weights, and the body points themselves.
+@dataclass(frozen=True, slots=True, eq=False)
+class _Binding:
+    """Body point and skin weights of each vertex of a mesh that lies on a posed body."""
 
-    Only body points that face the same way count as near: the inside of a sleeve hangs nearer to the trunk than to the
-    arm. Which way the garment faces is what most of it agrees on with the body.
-    """
-    model = tracked_body(body.shaped.body)
-    faces, skin = body.shaped.body.template.faces, body.vertices()
-    surface = PosedSurface(model, body, skin, vertex_normals(skin, faces))
-    vertices = mesh.vertices.astype(np.float64)
-    normals = vertex_normals(vertices, mesh.faces)
-    plain = match(surface, vertices, np.zeros_like(normals))
-    if np.einsum("va,va->v", plain.normals, normals).sum() < 0:
-        normals = -normals
-    matches = match(surface, vertices, NORMAL_WEIGHT * normals)
-    weights = np.einsum("vk,vkj->vj", matches.barycentric, body.shaped.body.skin_weights[faces[matches.faces]])
+    surface: PosedSurface
+    normals: Float64[np.ndarray, "verts 3"]
+    """Of the mesh, turned as the body faces, as long as they weigh in a match."""
+    nearest: Matches
+    faces: Int32[np.ndarray, " verts"]
+    barycentric: Float64[np.ndarray, "verts 3"]
+    weights: Float32[np.ndarray, "verts joints"]
+
+    @staticmethod
+    def to_nearest(mesh: Mesh, body: PosedBody) -> _Binding:
+        """To the nearest body points that face the same way.
+
+        The inside of a sleeve hangs nearer to the trunk than to the arm. Which way the garment faces is what most of it
+        agrees on with the body.
+        """
+        model, skin = tracked_body(body.shaped.body), body.vertices()
+        surface = PosedSurface(model, body, skin, vertex_normals(skin, body.shaped.body.template.faces))
+        vertices = mesh.vertices.astype(np.float64)
+        normals = vertex_normals(vertices, mesh.faces)
+        plain = match(surface, vertices, np.zeros_like(normals))
+        if np.einsum("va,va->v", plain.normals, normals).sum() < 0:
+            normals = -normals
+        normals = NORMAL_WEIGHT * normals
+        nearest = match(surface, vertices, normals)
+        weights = _smooth_weights(mesh, body.shaped.body, nearest.faces, nearest.barycentric)
+        return _Binding(surface, normals, nearest, nearest.faces, nearest.barycentric, weights)
+
+    def moved_to(self, mesh: Mesh, faces: np.ndarray, barycentric: np.ndarray) -> _Binding:
+        """To other body points."""
+        weights = _smooth_weights(mesh, self.surface.model.body, faces, barycentric)
+        return replace(self, faces=faces, barycentric=barycentric, weights=weights)
+
+
+def _smooth_weights(
+    mesh: Mesh, body: Body, faces: np.ndarray, barycentric: np.ndarray
+) -> Float32[np.ndarray, "verts joints"]:
+    """Skin weights of the body under each vertex, diffused over the mesh."""
+    weights = np.einsum("vk,vkj->vj", barycentric, body.skin_weights[body.template.faces[faces]])
     weights = diffuse(weights, mesh.faces, WEIGHT_SMOOTHING)
-    weights = (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
-    return matches.faces, matches.barycentric.astype(np.float32), weights, matches.points
+    return (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
 
 
 def _require_surface(mesh: Mesh, source: str, *, against: int) -> None:

@@ -17,6 +17,7 @@ from capture4d.mesh_files.meshes import read_mesh
 from capture4d.motions.motion_files import read_motion, told
 from capture4d.runs.stage import StageResult
 from capture4d.templates.body_regions import body_region
+from capture4d.templates.cage_files import read_cage
 from capture4d.templates.config import TEMPLATE, TemplateConfig
 from capture4d.templates.garment import TemplateReport, make_template
 from capture4d.templates.placing import Placed, find_placement
@@ -44,6 +45,7 @@ def run(
     *,
     body: Path | None = None,
     poses: Path | None = None,
+    cage: Path | None = None,
 ) -> TemplateResult:
     """Write a template. It is one file and takes seconds: there is nothing to resume, and no record of it.
 
@@ -53,6 +55,7 @@ def run(
         body: body.npz; the built-in one if None.
         poses: motion file that holds the pose and the shape in which the garment lies on the body; None is the rest
             pose of the mean shape.
+        cage: curves along which the mesh is shrunk onto the body, as `read_cage` has them; found if None.
     Raises:
         InputError: a file is missing or damaged, or the mesh cannot be a template.
     """
@@ -60,6 +63,9 @@ def run(
         raise InputError(f"expected a template file .npz, found '{output.suffix}'", where=output)
     if (mesh is None) == (config.region is None):
         raise InputError(f"template: expected a mesh or --region, found {'neither' if mesh is None else 'both'}")
+    if cage is not None and (mesh is None or not config.wrap):
+        raise InputError("template: expected --wrap and a mesh beside --cage, found it without")
+    marks = read_cage(cage) if cage else None
     wearer = load_body(body) if body else load_anny()
     posed = _posed(wearer, poses, config.pose_frame)
     placed = None
@@ -78,6 +84,8 @@ def run(
         uv=config.uv,
         uv_is_pattern=config.uv_is_pattern,
         names=config.loop_names,
+        wrap=config.wrap,
+        cage=marks,
         source=source,
     )
     save_garment(output, garment)

@@ -10,6 +10,7 @@ from capture4d.captures.names import telling_names, unknown_borders
 from capture4d.errors import InputError
 from capture4d.files.atomic import read_json
 from capture4d.templates.stage import TemplateResult
+from capture4d.templates.wrapping import Wrap
 
 __all__ = ["told"]
 
@@ -26,6 +27,8 @@ def told(result: TemplateResult) -> Iterator[str]:
     loops = ", ".join(f"{name} ({len(loop)})" for name, loop in garment.loops.items())
     yield f"borders: {loops}; with these names their paints stand in boundary_colours"
     yield f"UVs: {_uvs(result)}"
+    if report.wrap is not None:
+        yield f"wrapped: {_wrapped(report.wrap)}"
     yield from _other_names(result)
 
 
@@ -42,6 +45,15 @@ def _other_names(result: TemplateResult) -> Iterator[str]:
                 f"{description}: boundary_colours names {', '.join(unknown)}, which the template does not have; "
                 "rename the paints there, or the borders with --names"
             )
+
+
+def _wrapped(wrap: Wrap) -> str:
+    turned = f", {wrap.turned_in_percent:.1f} % in turned-in hems and collars" if wrap.turned_in_percent else ""
+    return (
+        f"{wrap.cage.patch_count} patches in a cage of {len(wrap.cage.vertices)} vertices; edges stretched "
+        f"unequally by {100 * wrap.spread:.0f} %, before equalisation {100 * wrap.spread_before:.0f} %; "
+        f"{wrap.flipped_percent:.1f} % of the faces face inwards{turned}"
+    )
 
 
 def _uvs(result: TemplateResult) -> str:

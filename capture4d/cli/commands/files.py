@@ -54,6 +54,12 @@ class Template(FileOptions, MeshOptions):
     """Of the mesh; `auto` takes the unit in which it lies on the body, and says it."""
     up: Axis | None = None
     """Axis of the mesh that points up; found by how it lies on the body, and said, if absent."""
+    wrap: bool = False
+    """Shrink the mesh onto the body and bind each vertex to where it comes to lie, without gaps and crowds: for offset
+    images. Without this it is bound to the nearest body point."""
+    cage: Path | None = None
+    """Curves along which --wrap does it: a .npy with a label for each triangle, which meet there, or a .json
+    {"curves": [[vertex, ...], ...]}. Found by panels and joints if absent."""
 
     def __call__(self) -> int:
         from capture4d import pipeline
@@ -67,9 +73,16 @@ class Template(FileOptions, MeshOptions):
             self.units,
             self.up,
             self.uv_is_pattern,
+            self.wrap,
         )
         result = pipeline.template(
-            self.mesh, self.output, config, body=self.body, poses=self.poses, overwrite=self.overwrite
+            self.mesh,
+            self.output,
+            config,
+            body=self.body,
+            poses=self.poses,
+            cage=self.cage,
+            overwrite=self.overwrite,
         )
         for note in result.notes:
             print(f"capture4d: {self.mesh}: {note}", file=sys.stderr)

@@ -1,0 +1,87 @@
+"""Offset images as files that other programs open: float TIFF in centimetres, or PNG with 16 bits over a range.
+
+RGB is tangent, bitangent, normal. A PNG tells its range and unit in text chunks; the folder's layout.json does as
+well. A program may write a PNG back with 8 bits.
+"""
+
+from __future__ import annotations
+
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float32
+
+from capture4d.errors import InputError
+from capture4d.files.atomic import write_bytes
+from capture4d.files.reading import reading
+from wrinkles.offset_images.editing.config import PictureFormat
+
+__all__ = ["RANGE_CM", "read_change", "write_picture"]
+
+RANGE_CM = 64.0
+"""Of a PNG, half of it below zero: 16 bits err by 0.005 mm."""
+FULL = {np.dtype(np.uint16): 65535.0, np.dtype(np.uint8): 255.0}
+
+
+def write_picture(path: Path, image: Float32[np.ndarray, "size size 3"], kind: PictureFormat) -> np.ndarray:
+    """Write one side.
+
+    Returns:
+        The values as the file has them: float32 of a TIFF, uint16 of a PNG.
+    Raises:
+        InputError: offsets beyond a PNG's range.
+    """
+    if kind == "png" and np.abs(image).max(initial=0.0) > RANGE_CM / 2:
+        worst = float(np.abs(image).max())
+        raise InputError(
+            f"expected offsets within {RANGE_CM / 2:g} cm for a PNG, found {worst:.1f}; use tif", where=path
+        )
+    values = image if kind == "tif" else np.round((image / RANGE_CM + 0.5) * 65535).astype(np.uint16)
+    good, data = cv2.imencode(f".{kind}", np.ascontiguousarray(values[..., ::-1]))
+    assert good
+    write_bytes(path, data.tobytes() if kind == "tif" else _with_text(data.tobytes()))
+    return values
+
+
+def read_change(path: Path, written: np.ndarray) -> Float32[np.ndarray, "size size 3"]:
+    """How a picture differs from what was written, centimetres; exactly 0 where nobody touched it.
+
+    Args:
+        written: what `write_picture` returned for it.
+    Raises:
+        InputError: the file is missing, damaged, or holds another kind of picture.
+    """
+    with reading(path, "picture"):
+        data = np.frombuffer(path.read_bytes(), np.uint8)
+        found = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
+        if found is None or found.ndim != 3 or found.shape[2] not in (3, 4):
+            raise InputError("expected a picture with three channels, found none, or a damaged one")
+        found = found[..., 2::-1]
+        if found.shape != written.shape:
+            raise InputError(f"expected {written.shape[1]} x {written.shape[0]} texels as it was drawn, found "
+                             f"{found.shape[1]} x {found.shape[0]}")  # fmt: skip
+        if written.dtype.kind == "f":
+            if found.dtype.kind != "f":
+                raise InputError(f"expected 32 bits of float in a channel as it was drawn, found {found.dtype}")
+            if not np.isfinite(found).all():
+                raise InputError("expected finite offsets, found others")
+            return (found.astype(np.float64) - written).astype(np.float32)
+        if found.dtype not in FULL:
+            raise InputError(f"expected 16 or 8 bits a channel, found {found.dtype}")
+        full = FULL[found.dtype]
+        before = written if found.dtype == written.dtype else np.round(written / 257.0)
+        return (RANGE_CM / full * (found.astype(np.float64) - before)).astype(np.float32)
+
+
+def _with_text(data: bytes) -> bytes:
+    """A PNG with its unit and range in text chunks behind its header, its pixels untouched."""
+    header = 8 + 25  # signature and IHDR
+    told = {"unit": "cm", "range": f"{-RANGE_CM / 2:g} {RANGE_CM / 2:g}"}
+    chunks = b"".join(_text_chunk(f"{key}\0{value}".encode("latin-1")) for key, value in told.items())
+    return data[:header] + chunks + data[header:]
+
+
+def _text_chunk(body: bytes) -> bytes:
+    return len(body).to_bytes(4, "big") + b"tEXt" + body + zlib.crc32(b"tEXt" + body).to_bytes(4, "big")
