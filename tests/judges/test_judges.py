@@ -87,3 +87,8 @@ def test_three_js_shows_what_was_exported_and_the_validator_finds_no_error(expor
         "node", HERE / "check_in_browser.mjs", exports / "garment.glb", folder / "vertices.npy", "--fps", fps,
         "--normal-map", "--tolerance-mm", tolerance,
     )  # fmt: skip
+
+
+@needs_browser
+def test_the_page_works_from_disk_and_asks_for_nothing(exported: tuple[Path, float, int]):
+    judged("node", HERE / "check_page.mjs", exported[0] / "work" / "exports" / "garment.html", 36)
