@@ -5,6 +5,7 @@ Alembic winds faces clockwise. The package is alembic3d, an unofficial build of 
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -70,9 +71,7 @@ def _time_sampling(moving: MovingMesh, times: np.ndarray) -> Any:
 
 
 def _imath() -> Any:
-    package_module(ALEMBIC, "Abc")  # which says what is missing
-    import importlib
-
+    package_module(ALEMBIC, "Abc")  # which says what is missing, and brings it
     return importlib.import_module("imath")
 
 
