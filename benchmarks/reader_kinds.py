@@ -33,6 +33,8 @@ from benchmarks.reader_values import (
     SMPL_BODY,
     SMPL_POSES,
 )
+from capture4d.app.importing.config import ImportConfig
+from capture4d.app.importing.sequences import read_sequence
 from capture4d.body.smpl import read_smpl
 from capture4d.cameras.colmap import read_model, write_model
 from capture4d.captures.capture import Capture, read_capture, read_scan, write_capture_description
@@ -60,6 +62,8 @@ from capture4d.files.records import (
     save_rig,
 )
 from capture4d.files.tensors import read_tensors, write_tensors
+from capture4d.mesh_files.animated.moving_mesh import MovingMesh
+from capture4d.mesh_files.animated.point_caches import write_mdd, write_pc2
 from capture4d.mesh_files.meshes import read_coloured_mesh, read_mesh, write_mesh
 from capture4d.motions.bvh import Bvh, format_bvh, moved_by_root
 from capture4d.motions.motion_files import read_motion, write_amass, write_bvh
@@ -244,6 +248,13 @@ def _colmap(name: str, *, text: bool, optional: bool = False) -> Kind:
                 optional=optional, names_other=True)  # fmt: skip
 
 
+MOVING = MovingMesh(MESH, np.array([3, 4], np.int32), 50.0, lambda: iter([MESH.vertices, MESH.vertices]))
+
+
+def _moving(path: Path) -> list[np.ndarray]:
+    return list(read_sequence(path, MESH, ImportConfig(fps=50.0)).frames())
+
+
 KINDS = [
     Kind("mesh.obj", lambda path: write_mesh(path, MESH, polygon_sizes=_POLYGONS), read_coloured_mesh),
     Kind("coloured.obj", lambda path: write_mesh(path, MESH, colours=_COLOURS), read_coloured_mesh),
@@ -257,6 +268,8 @@ KINDS = [
     *(Kind(f"skin.{ending}", _picture(kind), _beside, names_other=True)
       for ending, kind in (("png", "png"), ("jpg", "jpeg"), ("tif", "tiff"), ("bmp", "bmp"), ("webp", "webp"),
                            ("tga", "tga"))),
+    Kind("cache.pc2", lambda path: write_pc2(path, MOVING), _moving),
+    Kind("cache.mdd", lambda path: write_mdd(path, MOVING), _moving),
     Kind("body.npz", lambda path: save_body(path, BODY), load_body),
     Kind("garment.npz", lambda path: save_garment(path, GARMENT), load_garment),
     Kind("poses.npz", lambda path: save_poses(path, POSES), load_poses),

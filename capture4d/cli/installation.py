@@ -31,7 +31,11 @@ __all__ = ["Cache", "Diagnosis", "Machine", "Part", "as_json", "as_text", "diagn
 
 State = Literal["found", "missing", "broken", "other version"]
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-OPTIONAL = {"meshmonk": "a peer of `python -m benchmarks registration`"}
+OPTIONAL = {
+    "alembic3d": "`export --format abc`",
+    "meshmonk": "a peer of `python -m benchmarks registration`",
+    "usd-core": "`export --format usd`",
+}
 """Distributions that something is better with, and what."""
 CUDA = "`--device cuda` of fit and animate"
 _MODULES = {
@@ -39,6 +43,7 @@ _MODULES = {
     "libusb-package": "libusb_package",
     "opencv-contrib-python-headless": "cv2",
     "pillow": "PIL",
+    "usd-core": "pxr",
     "warp-lang": "warp",
 }
 """What is imported, where it is not called as the distribution."""

@@ -66,7 +66,7 @@ def test_blender_shows_what_was_exported(kind: str, exported: tuple[Path, float,
             more = ["--normals-p99-deg", 0.1]
         case "glb":
             if fps != int(fps):
-                pytest.skip("Blender takes the rate of a GLB for a whole number")
+                pytest.skip("Blender puts keys of a GLB elsewhere at such a rate, but for the script")
             first, more = 0, ["--normal-map", "static"]
             tolerance = read_json(exports / "export.json")["files"]["glb"]["error_mm"] + 0.002
         case _:
@@ -78,6 +78,18 @@ def test_blender_shows_what_was_exported(kind: str, exported: tuple[Path, float,
     )  # fmt: skip
 
 
+@needs_blender
+@pytest.mark.parametrize("kind", ["usdc", "abc", "pc2", "glb"])
+def test_the_script_sets_rate_range_and_maps(kind: str, exported: tuple[Path, float, int]):
+    folder, fps, first = exported
+    exports = folder / "work" / "exports"
+    if not (exports / f"garment.{kind}").is_file():
+        pytest.skip(f"no {kind}: its package is not installed")
+    told = read_json(exports / "export.json")["files"]["glb"]["error_mm"] if kind == "glb" else 0
+    script, vertices = exports / "open_in_blender.py", folder / "vertices.npy"
+    judged(BLENDER, HERE / "check_opened.py", script, vertices, fps, first, told + 0.002, f"garment.{kind}")
+
+
 @needs_browser
 def test_three_js_shows_what_was_exported_and_the_validator_finds_no_error(exported: tuple[Path, float, int]):
     folder, fps, _ = exported
@@ -87,3 +99,8 @@ def test_three_js_shows_what_was_exported_and_the_validator_finds_no_error(expor
         "node", HERE / "check_in_browser.mjs", exports / "garment.glb", folder / "vertices.npy", "--fps", fps,
         "--normal-map", "--tolerance-mm", tolerance,
     )  # fmt: skip
+
+
+@needs_browser
+def test_the_page_works_from_disk_and_asks_for_nothing(exported: tuple[Path, float, int]):
+    judged("node", HERE / "check_page.mjs", exported[0] / "work" / "exports" / "garment.html", 36)

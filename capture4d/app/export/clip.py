@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Int64
+from jaxtyping import Int64
 
 from capture4d.app.export.skeleton import Skeleton
 from capture4d.body.skinning import with_shape
-from capture4d.captures.work_folder import WorkFolder
+from capture4d.captures.work_folder import WorkFolder, load_registration
 from capture4d.errors import InputError
+from capture4d.files.arrays import map_array
 from capture4d.files.records import load_garment
 from capture4d.mesh_files.animated.moving_mesh import MovingMesh
 from capture4d.runs.frame_lists import chosen_frames, frame_file, listed
 from capture4d.runs.stage import read_record
+from capture4d.types import Garment
 
 __all__ = ["Clip", "MapFolder", "read_clip"]
+
+_AT_ONCE = 64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,16 +60,20 @@ def read_clip(work: WorkFolder, frames: str = "", *, with_maps: bool = True) -> 
     Raises:
         InputError: nothing is registered, nobody knows the frame rate, or there are no such frames.
     """
-    registered, notes = work.registered, []
-    ids = registered.frame_ids.tolist()
-    chosen = chosen_frames(frames, ids) if frames else tuple(ids)
-    rows = np.searchsorted(registered.frame_ids, np.array(chosen))
+    notes: list[str] = []
+    # Not the folder's own, which would keep in memory what was touched of it.
+    folder = work.path / "registration"
+    registered = load_registration(folder)
+    garment, ids = registered.garment, registered.frame_ids
+    del registered
+    chosen = chosen_frames(frames, ids.tolist()) if frames else tuple(ids.tolist())
+    rows = np.searchsorted(ids, np.array(chosen))
     failed = sorted(work.failed_frames & {*chosen})
     if failed:
         notes.append(
             f"{len(failed)} of {len(chosen)} frames have failed, and are exported as they are: {listed(failed)}"
         )
-    maps, mesh = (_maps(work, notes) if with_maps else None), registered.garment.template
+    maps, mesh = (_maps(work, notes) if with_maps else None), garment.template
     if maps is not None:
         missing = [frame_id for frame_id in chosen if not maps.file(frame_id).is_file()]
         if missing:
@@ -74,17 +82,20 @@ def read_clip(work: WorkFolder, frames: str = "", *, with_maps: bool = True) -> 
         else:
             mesh = load_garment(maps.path / "template.npz").template  # its UVs are those of the maps
     moving = MovingMesh(
-        replace(mesh, vertices=np.array(registered.vertices[rows[0]])),
-        registered.frame_ids[rows],
+        mesh.with_vertices(next(_rows(folder / "vertices.npy", rows))),
+        ids[rows],
         _frame_rate(work),
-        partial(_rows, registered.vertices, rows),
+        partial(_rows, folder / "vertices.npy", rows),
     )
-    return Clip(moving, _skeleton(work, chosen), maps, notes)
+    return Clip(moving, _skeleton(work, garment, chosen), maps, notes)
 
 
-def _rows(vertices: Float32[np.ndarray, "frames verts 3"], rows: Int64[np.ndarray, " chosen"]) -> Iterator[np.ndarray]:
-    for row in rows:
-        yield np.array(vertices[row])
+def _rows(path: Path, rows: Int64[np.ndarray, " chosen"]) -> Iterator[np.ndarray]:
+    """Rows of an array on disk, of which no more than a few stay in memory."""
+    for start in range(0, len(rows), _AT_ONCE):
+        mapped = map_array(path)
+        for row in rows[start : start + _AT_ONCE]:
+            yield np.array(mapped[row])
 
 
 def _frame_rate(work: WorkFolder) -> float:
@@ -98,8 +109,8 @@ def _frame_rate(work: WorkFolder) -> float:
     return work.capture.fps
 
 
-def _skeleton(work: WorkFolder, frames: Sequence[int]) -> Skeleton | None:
-    weights = work.registered.garment.skin_weights
+def _skeleton(work: WorkFolder, garment: Garment, frames: Sequence[int]) -> Skeleton | None:
+    weights = garment.skin_weights
     posed = None if weights is None else work.posed_body
     if weights is None or posed is None:
         return None

@@ -24,7 +24,7 @@ from capture4d.learning.principal_directions import exact_directions
 from capture4d.mesh_files.animated.moving_mesh import MovingMesh
 from capture4d.mesh_files.gltf.animated_scene import SceneTargets
 
-__all__ = ["FitError", "exact_targets", "fit_targets"]
+__all__ = ["FitError", "FitLimits", "exact_targets", "fit_targets"]
 
 _AT_ONCE = 2_000_000
 """Coordinates of the frames that are worked on together: 16 MB in float64."""
@@ -40,6 +40,18 @@ class FitError:
     mean_mm: float
     p99_mm: float
     max_mm: float
+
+
+@dataclass(frozen=True, slots=True)
+class FitLimits:
+    """How far off vertices may be, millimetres, and what that may cost."""
+
+    p99_mm: float
+    """99 of 100 vertices of all frames, and ..."""
+    max_mm: float
+    """... all of them."""
+    most: int
+    """Targets, whatever the error."""
 
 
 class _Tally:
@@ -86,28 +98,23 @@ def fit_targets(
     moving: MovingMesh,
     skeleton: Skeleton | None,
     scratch: Path,
-    *,
-    p99_mm: float,
-    max_mm: float,
-    most: int,
+    limits: FitLimits,
 ) -> tuple[SceneTargets, FitError]:
     """As few targets as keep an error.
 
     Args:
         skeleton: None leaves the frames in the world, as those of a garment without a body have to be.
         scratch: file for the frames in the rest pose, which need not fit into memory.
-        p99_mm: 99th percentile of the error over all vertices of all frames, and `max_mm` its largest value.
-        most: targets at most, whatever the error.
     Returns:
         The targets, and their error in the world.
     """
     rest = _Rest.write(moving, skeleton, scratch)
-    mean, directions = rest.directions(most)
+    mean, directions = rest.directions(limits.most)
     coefficients = np.concatenate([(block - mean) @ directions.T for block in rest.blocks()])
 
     def is_enough(count: int) -> bool:
         found = rest.error(mean, directions[:count], coefficients[:, :count])
-        return found.p99_mm <= p99_mm and found.max_mm <= max_mm
+        return found.p99_mm <= limits.p99_mm and found.max_mm <= limits.max_mm
 
     count = _fewest(is_enough, len(directions))
     base, directions, weights = _between_0_and_1(mean, directions[:count], coefficients[:, :count])

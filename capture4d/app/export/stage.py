@@ -23,6 +23,7 @@ import numpy as np
 
 from capture4d.app.export.clip import Clip, read_clip
 from capture4d.app.export.config import ExportConfig, Format
+from capture4d.app.export.correctives import FitError
 from capture4d.app.export.maps import map_name, write_maps
 from capture4d.app.export.writers import Written, file_of, write_format, write_sequence
 from capture4d.captures.work_folder import WorkFolder
@@ -126,8 +127,6 @@ def _known(stage: Stage, record: dict[str, Any], kind: Format) -> Written | None
     told = record["files"].get(kind)
     if told is None or not (stage.path / told["file"]).exists():
         return None
-    from capture4d.app.export.correctives import FitError
-
     fit = None if told["fit"] is None else FitError(**told["fit"])
     return Written(told["file"], told["error_mm"], fit, told["targets"], tuple(told["faults"]))
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from capture4d.app.export.clip import Clip
 from capture4d.app.export.config import ExportConfig, Format
-from capture4d.app.export.correctives import FitError, exact_targets, fit_targets
+from capture4d.app.export.correctives import FitError, FitLimits, exact_targets, fit_targets
 from capture4d.app.export.glb_check import largest_glb_difference
 from capture4d.app.export.maps import map_bytes, map_name
 from capture4d.app.export.web_page import require_page, write_page
@@ -125,8 +125,8 @@ def _write_glb(path: Path, clip: Clip, config: ExportConfig) -> Written:
         targets, error = exact_targets(moving)
     else:
         scratch = path.with_name("rest.f32")
-        limits = {"p99_mm": glb.p99_mm, "max_mm": glb.max_mm, "most": glb.most}
-        targets, error = fit_targets(moving, skeleton, scratch, **limits)
+        limits = FitLimits(glb.p99_mm, glb.max_mm, glb.most)
+        targets, error = fit_targets(moving, skeleton, scratch, limits)
         scratch.unlink()
     first = int(moving.frame_ids[0])
     still = None if clip.maps is None else map_bytes(clip.maps, first, 8)
@@ -137,9 +137,9 @@ def _write_glb(path: Path, clip: Clip, config: ExportConfig) -> Written:
     write_animated_glb(path, AnimatedScene(moving.mesh, times, targets, skin, still, {"capture4d": told}, clock))
     found = 1000 * largest_glb_difference(path, moving)
     _require_close(path, found, error.max_mm + _GLB_AGREES_MM)
-    limits = {"p99_mm": glb.p99_mm, "max_mm": glb.max_mm} if glb.motion == "skinned" else {"max_mm": EXACT_MM}
-    broken = {name: limit for name, limit in limits.items() if getattr(error, name) > limit}
-    faults = [f"{name} {getattr(error, name):.3f} > {limit:g}" for name, limit in broken.items()]
+    at_99, at_most = (glb.p99_mm, glb.max_mm) if glb.motion == "skinned" else (EXACT_MM, EXACT_MM)
+    told_of = (("p99_mm", error.p99_mm, at_99), ("max_mm", error.max_mm, at_most))
+    faults = [f"{name} {value:.3f} > {limit:g}" for name, value, limit in told_of if value > limit]
     return Written(path.name, error.max_mm, error, len(targets.directions), faults)
 
 

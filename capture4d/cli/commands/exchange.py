@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, UseAppendAction, arg
 
@@ -14,6 +14,9 @@ from capture4d.app.importing.config import ImportConfig
 from capture4d.cli.exit_codes import BAD_RESULT, GOOD
 from capture4d.cli.options import MeshOptions, ProgressOptions, StageOptions
 from capture4d.errors import CommandLineError
+
+if TYPE_CHECKING:
+    from capture4d.app.export.correctives import FitError
 
 __all__ = ["Export", "Import", "Score"]
 
@@ -73,11 +76,10 @@ class Export(_Alone):
         return BAD_RESULT if broken else GOOD
 
 
-def _error(largest: float, fit: object, targets: int | None) -> str:
+def _error(largest: float, fit: FitError | None, targets: int | None) -> str:
     if fit is None:
         return f"read back within {largest:.4f} mm"
-    mean, p99 = getattr(fit, "mean_mm", 0.0), getattr(fit, "p99_mm", 0.0)
-    return f"{targets} shapes, error {mean:.3f} mm in the mean, {p99:.3f} at 99 %, {largest:.3f} at most"
+    return f"{targets} shapes, error {fit.mean_mm:.3f} mm in the mean, {fit.p99_mm:.3f} at 99 %, {largest:.3f} at most"
 
 
 @dataclass(frozen=True, kw_only=True)

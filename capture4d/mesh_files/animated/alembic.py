@@ -5,6 +5,7 @@ Alembic winds faces clockwise. The package is alembic3d, an unofficial build of 
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -21,6 +22,8 @@ from capture4d.mesh_files.polygons import polygon_mesh
 from capture4d.types import Mesh
 
 __all__ = ["read_alembic", "write_alembic"]
+
+_AT_ONCE = 200
 
 
 def write_alembic(path: Path, moving: MovingMesh, *, name: str = "garment", normals: bool = True) -> None:
@@ -68,9 +71,7 @@ def _time_sampling(moving: MovingMesh, times: np.ndarray) -> Any:
 
 
 def _imath() -> Any:
-    package_module(ALEMBIC, "Abc")  # which says what is missing
-    import importlib
-
+    package_module(ALEMBIC, "Abc")  # which says what is missing, and brings it
     return importlib.import_module("imath")
 
 
@@ -94,30 +95,36 @@ def read_alembic(path: Path, fps: float | None = None) -> MovingMesh:
     Raises:
         InputError: alembic3d is not installed, the file is damaged, or holds no mesh that moves with one topology.
     """
-    Abc, AbcGeom = (package_module(ALEMBIC, each) for each in ("Abc", "AbcGeom"))
+    package_module(ALEMBIC, "Abc")
     with reading(path, "Alembic file"):
         path.stat()
         try:
-            archive = Abc.IArchive(str(path))
+            schemas = _schemas(path)
+        except InputError:
+            raise
         except Exception as error:  # the bindings hand on C++ exceptions of several kinds
             raise InputError(f"not an Alembic file, or damaged ({str(error)[:120]})") from None
-        schemas = [
-            AbcGeom.IPolyMesh(each.getParent(), each.getName()).getSchema() for each in _meshes(archive, AbcGeom)
-        ]
         if not schemas:
             raise InputError("expected a mesh, found none")
-        schema = max(schemas, key=lambda each: len(each.getValue(next(_selectors(each))).getPositions()))
+        sizes = [len(each.getValue(next(_selectors(each))).getPositions()) for each in schemas]
+        at = sizes.index(max(sizes))
+        schema, frames = schemas[at], partial(_positions, path, at)
         count, sampling = schema.getNumSamples(), schema.getTimeSampling()
-        times = np.array([sampling.getSampleTime(at) for at in range(count)])
+        times = np.array([sampling.getSampleTime(each) for each in range(count)])
         rate = fps or (1 / np.diff(times).min() if count > 1 else 24.0)
         ids = np.rint(times * rate)
         if np.abs(ids - times * rate).max(initial=0) > 0.1:
             raise InputError(f"expected times of frames at {rate:g} a second, found others")
-        frames = partial(_positions, archive, schema)
         shape = _shape(schema.getValue(next(_selectors(schema))), schema, next(frames()))
-        has_normals = schema.getNormalsParam().valid()
-        normals = partial(_normals, archive, schema) if has_normals else None
+        normals = partial(_normals, path, at) if schema.getNormalsParam().valid() else None
         return MovingMesh(shape, ids.astype(np.int32), float(rate), frames, normals)
+
+
+def _schemas(path: Path) -> list[Any]:
+    """Of the meshes in a file, always in one order."""
+    Abc, AbcGeom = (package_module(ALEMBIC, each) for each in ("Abc", "AbcGeom"))
+    found = _meshes(Abc.IArchive(str(path)), AbcGeom)
+    return [AbcGeom.IPolyMesh(each.getParent(), each.getName()).getSchema() for each in found]
 
 
 def _meshes(archive: Any, AbcGeom: Any) -> Iterator[Any]:
@@ -153,17 +160,27 @@ def _shape(sample: Any, schema: Any, vertices: np.ndarray) -> Mesh:
     return polygon_mesh(vertices, corners[order], sizes, None if uv is None else uv[order])[0].mesh
 
 
-def _positions(archive: Any, schema: Any) -> Iterator[np.ndarray]:
-    """Args: archive: kept open while its frames are read."""
-    for selector in _selectors(schema):
+def _positions(path: Path, at: int) -> Iterator[np.ndarray]:
+    for schema, selector in _samples(path, at):
         sample = schema.getValue(selector)  # whose memory the positions are
         yield _array(sample.getPositions())
 
 
-def _normals(archive: Any, schema: Any) -> Iterator[np.ndarray]:
-    for selector in _selectors(schema):
+def _normals(path: Path, at: int) -> Iterator[np.ndarray]:
+    for schema, selector in _samples(path, at):
         sample = schema.getNormalsParam().getExpandedValue(selector)
         yield _array(sample.getVals())
+
+
+def _samples(path: Path, at: int) -> Iterator[tuple[Any, Any]]:
+    """The mesh with this number, and a selector of each of its samples. The file is opened again now and then, for what
+    was read of it stays in memory."""
+    selectors = list(_selectors(_schemas(path)[at]))
+    for start in range(0, len(selectors), _AT_ONCE):
+        schema = _schemas(path)[at]
+        for selector in selectors[start : start + _AT_ONCE]:
+            yield schema, selector
+        del schema
 
 
 def _selectors(schema: Any) -> Iterator[Any]:

@@ -68,10 +68,10 @@ def read_pc2(path: Path, mesh: Mesh) -> MovingMesh:
             raise InputError("expected a PC2 file, which begins with POINTCACHE2, found something else")
         _, _, verts, first, step, count = _PC2.unpack(head)
         _require(path, mesh, verts, count, _PC2.size)
-        if step <= 0 or step != int(step) or first != int(first):
+        if not (step >= 1 and step == int(step) and first == int(first) and 0 <= first + step * count < 2**31):
             raise InputError(f"expected whole frames, found a first frame of {first:g} and steps of {step:g}")
         ids = (int(first) + int(step) * np.arange(count)).astype(np.int32)
-    return MovingMesh(mesh, ids, None, partial(_rows, path, _PC2.size, verts, count, "<f4"))
+        return MovingMesh(mesh, ids, None, partial(_rows, path, _PC2.size, verts, count, "<f4"))
 
 
 def read_mdd(path: Path, mesh: Mesh, fps: float) -> MovingMesh:
@@ -91,10 +91,10 @@ def read_mdd(path: Path, mesh: Mesh, fps: float) -> MovingMesh:
             _require(path, mesh, verts, count, _MDD.size + 4 * max(count, 0))
             frames = np.frombuffer(file.read(4 * count), ">f4").astype(np.float64) * fps
         ids = np.rint(frames)
-        if np.abs(frames - ids).max(initial=0) > 0.1:
+        if not (np.abs(frames - ids) <= 0.1).all() or not (np.abs(ids) < 2**31).all():
             raise InputError(f"expected times of frames at {fps:g} a second, found others")
-    start = _MDD.size + 4 * count
-    return MovingMesh(mesh, ids.astype(np.int32), fps, partial(_rows, path, start, verts, count, ">f4"))
+        start = _MDD.size + 4 * count
+        return MovingMesh(mesh, ids.astype(np.int32), fps, partial(_rows, path, start, verts, count, ">f4"))
 
 
 def _require(path: Path, mesh: Mesh, verts: int, count: int, start: int) -> None:

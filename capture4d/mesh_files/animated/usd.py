@@ -160,12 +160,12 @@ def read_usd(path: Path) -> MovingMesh:
         ids = np.rint(times).astype(np.int32)
         if np.abs(ids - np.asarray(times)).max() > 1e-3:
             raise InputError("expected time codes that are whole frames, found others")
-        frames = partial(_positions, stage, mesh, times)
-        first = next(frames())
-        shape = _shape(mesh, times[0], first)
+        place = str(mesh.GetPath())
+        frames = partial(_positions, path, place, times)
+        shape = _shape(mesh, times[0], next(frames()))
         has_normals = mesh.GetNormalsInterpolation() == "vertex" and mesh.GetNormalsAttr().HasAuthoredValue()
         fps = float(stage.GetTimeCodesPerSecond())
-        return MovingMesh(shape, ids, fps, frames, partial(_normals, mesh, times) if has_normals else None)
+        return MovingMesh(shape, ids, fps, frames, partial(_normals, path, place, times) if has_normals else None)
 
 
 def _size(mesh: Any) -> int:
@@ -196,20 +196,33 @@ def _shape(mesh: Any, time: float, vertices: np.ndarray) -> Mesh:
     return polygon_mesh(vertices, corners, sizes, uv)[0].mesh
 
 
-def _positions(stage: Any, mesh: Any, times: Sequence[float]) -> Iterator[np.ndarray]:
+def _meshes(path: Path, place: str, times: Sequence[float]) -> Iterator[tuple[float, Any]]:
+    """The mesh at each time. The file is opened again now and then, for what was read of it stays in memory."""
+    Usd, UsdGeom = (package_module(USD, each) for each in ("Usd", "UsdGeom"))
+    for start in range(0, len(times), _SAVED_AFTER):
+        stage = Usd.Stage.Open(str(path))
+        mesh = UsdGeom.Mesh(stage.GetPrimAtPath(place))
+        for time in times[start : start + _SAVED_AFTER]:
+            yield time, mesh
+        del mesh, stage
+
+
+def _positions(path: Path, place: str, times: Sequence[float]) -> Iterator[np.ndarray]:
     """Points in the world, in metres, Y up."""
     UsdGeom = package_module(USD, "UsdGeom")
-    unit = UsdGeom.GetStageMetersPerUnit(stage)
-    is_z_up = UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z
-    for time in times:
+    for time, mesh in _meshes(path, place, times):
+        stage = mesh.GetPrim().GetStage()
+        unit = UsdGeom.GetStageMetersPerUnit(stage)
+        is_z_up = UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z
         points = np.array(mesh.GetPointsAttr().Get(time), np.float32).reshape(-1, 3)
         matrix = np.array(UsdGeom.Xformable(mesh).ComputeLocalToWorldTransform(time))  # of row vectors
         if is_z_up or unit != 1 or not np.array_equal(matrix, np.eye(4)):
             world = unit * (points.astype(np.float64) @ matrix[:3, :3] + matrix[3, :3])
             points = (world[:, [0, 2, 1]] * (1, 1, -1) if is_z_up else world).astype(np.float32)
+        del stage
         yield points
 
 
-def _normals(mesh: Any, times: Sequence[float]) -> Iterator[np.ndarray]:
-    for time in times:
+def _normals(path: Path, place: str, times: Sequence[float]) -> Iterator[np.ndarray]:
+    for time, mesh in _meshes(path, place, times):
         yield np.array(mesh.GetNormalsAttr().Get(time), np.float32).reshape(-1, 3)

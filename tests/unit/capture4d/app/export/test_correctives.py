@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from capture4d.app.export.clip import read_clip
-from capture4d.app.export.correctives import exact_targets, fit_targets
+from capture4d.app.export.correctives import FitLimits, exact_targets, fit_targets
 from capture4d.app.export.glb_check import largest_glb_difference
 from capture4d.app.export.skeleton import four_influences
 from capture4d.captures.work_folder import open_work
@@ -20,7 +20,7 @@ from tests.moving_garment import write_moving_work
 
 
 def fitted(clip, scratch: Path, *, p99_mm: float = 0.5, max_mm: float = 2.0, most: int = 128):
-    return fit_targets(clip.moving, clip.skeleton, scratch, p99_mm=p99_mm, max_mm=max_mm, most=most)
+    return fit_targets(clip.moving, clip.skeleton, scratch, FitLimits(p99_mm, max_mm, most))
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])

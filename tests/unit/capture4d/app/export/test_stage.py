@@ -1,6 +1,8 @@
 """The command: what is there stays, what is stale is refused, what is written was read back."""
 
+import base64
 import json
+import re
 from pathlib import Path
 
 import cv2
@@ -117,3 +119,15 @@ def test_the_script_for_blender_is_python_and_knows_the_take(work: Path):
 def test_a_folder_without_a_registration_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     (tmp_path / "empty").mkdir()
     assert "expected a work folder with a registration, found none" in fails(capsys, "export", tmp_path / "empty")
+
+
+def test_a_page_holds_everything_and_names_nothing_elsewhere(work: Path):
+    assert run("export", work, "--format", "html", "--format", "glb", "--quiet") == GOOD
+    text = (work / "exports" / "garment.html").read_text()
+    take = json.loads(text.partition('<script id="take" type="application/json">')[2].partition("</script>")[0])
+    assert base64.b64decode(take["glb"]) == (work / "exports" / "garment.glb").read_bytes()
+    assert take["frames"] == [3, 4, 5, 6]
+    assert len({*take["maps"]}) == 4
+    assert "default-src 'none'" in text
+    assert not re.search(r"""(?:src|href)\s*=\s*["']?[^"'\s>]*//""", text), "nothing is loaded from anywhere"
+    assert "The MIT License" in text
