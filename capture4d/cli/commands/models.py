@@ -66,7 +66,7 @@ class Animate(GradedOptions):
     """Another person, a body.npz of the same faces and joints."""
     beta: tuple[Number, ...] | None = None
     """Shape of the person, in standard deviations; the captured person without --body and --beta."""
-    style: tuple[str, ...] = ()
+    styles: Annotated[tuple[str, ...], arg(name="style")] = ()
     """Numbers of the pattern, NAME=VALUE each, for a garment with styles; in the middle of their range without."""
     device: str = "cpu"
     """Where torch computes, such as cpu or cuda."""
@@ -82,7 +82,7 @@ class Animate(GradedOptions):
             self.poses,
             self.output,
             self.config,
-            wearer=Wearer(self.body, self.beta, _numbers(self.style) if self.style else None),
+            wearer=Wearer(self.body, self.beta, _numbers(self.styles) if self.styles else None),
             device=self.device,
             workers=self.workers,
             overwrite=self.overwrite,
