@@ -142,6 +142,7 @@ def _write_styles(path: Path, *, method: str) -> None:
     from retarget.mixture.predictors import Ensemble, Mixture
     from retarget.mixture.styled_garment import Canonical, StyledGarment
     from retarget.mixture.training import made_network
+    from retarget.regression.known_range import PoseRange
 
     count, config = 3 * len(MESH.vertices), NetworkConfig(hidden=2)
     pose = PoseNumbers((1,), "axis-angle", np.zeros(3), np.ones(3))
@@ -153,7 +154,8 @@ def _write_styles(path: Path, *, method: str) -> None:
                       RNG.random((1, count // 3, 3)), 0.01, True)  # fmt: skip
     ranges = Ranges({"length": (0.4, 0.8)}, [(-1.0, 1.0)])
     predictor = ensemble if method == "ensemble" else mixture
-    save_styled_garment(path.parent, StyledGarment(GARMENT, BODY, ranges, pose, canonical, predictor, True))
+    known = PoseRange(np.tile(np.array([0, 0, 0, 1], np.float32), (2, 1, 1)), (1,), 5.0)
+    save_styled_garment(path.parent, StyledGarment(GARMENT, BODY, ranges, pose, canonical, predictor, True, known))
 
 
 def _read_styles(path: Path) -> Any:

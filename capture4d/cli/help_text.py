@@ -66,7 +66,10 @@ EXAMPLES: Mapping[str, Sequence[str]] = {
     "diff": ("diff before after", "diff before after --fail-if-worse fit_mean_mm=5"),
     "fit": ("fit work", "fit walk run jump --output shirt"),
     "fit-styles": ("fit-styles styles --output model", "fit-styles styles --output model --preset paper"),
-    "animate": ("animate work --poses motion.bvh --output dance --beta 1.5 2.0",),
+    "animate": (
+        "animate work --poses motion.bvh --output dance --beta 1.5 2.0",
+        "animate model --poses motion.bvh --output dance --style length=0.7",
+    ),
     "wrinkles maps": ("wrinkles maps work",),
     "wrinkles train": ("wrinkles train work --output model",),
     "wrinkles apply": ("wrinkles apply model work --bits 8 --flip-green",),

@@ -13,41 +13,32 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Float64
 
 from capture4d.body.skinning import ShapedBody
-from capture4d.captures.work_folder import ANIMATE, VERDICTS, stack_vertices
+from capture4d.captures.work_folder import ANIMATE
 from capture4d.errors import InputError
 from capture4d.files.arrays import map_array
-from capture4d.files.atomic import file_digest, read_json, write_json, write_json_lines, write_npy, write_npz
+from capture4d.files.atomic import file_digest, write_npy
 from capture4d.files.outputs import require_apart
 from capture4d.files.records import load_body, load_poses, save_body, save_garment, save_poses
 from capture4d.motions.motion_files import rate_note, read_motion, resample, same_rate, told
 from capture4d.runs.stage import Stage, StageResult, open_stage
 from capture4d.runs.workers import run_jobs
 from capture4d.types import PoseSequence
-from retarget.animation.animator import FRAMES_AT_ONCE, AnimatedFrame, Animator
+from retarget.animation.animator import FRAMES_AT_ONCE, Animator
 from retarget.animation.bodies import captured_person, person_of_shape, require_motion, retargeted_mean
+from retarget.animation.frame_files import SCHEMA, FrameFiles, collect, motion_files, write_frame
 from retarget.animation.frame_rates import coefficients_at, seconds
 from retarget.animation.garment_model import GarmentModel, load_garment_model
 from retarget.config import AnimateConfig
+from retarget.mixture.config import MODEL as STYLES_MODEL
 from retarget.model_folder import regressor_files
 from retarget.regression.controls import control_vectors
 
 __all__ = ["Wearer", "run", "run_on_coefficients"]
-
-SCHEMA = 2
-INSIDE_CHECK_PERCENT = 0.3
-"""A frame with more of its vertices inside the body, after all, is flagged."""
-STRETCH_CHECK, STRETCH_FAIL = 1.4, 2.5
-"""A frame with edges so much longer than the template's, 99th percentile, is flagged, or has failed: cloth does not
-stretch like that. The limits are registration's (`quality.stretch_check`, `quality.stretch_fail`)."""
-FLIPPED_CHECK_PERCENT = 1.0
-"""A frame with more of its faces turned against the body is flagged (registration's `quality.flipped_check_percent`,
-which goes by the scan)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +50,8 @@ class Wearer:
     beta: Sequence[float] | None = None
     """Shape coefficients of the person; without them those of the poses.npz beside `body`, and without that as well the
     mean of `body`."""
+    style: Mapping[str, float] | None = None
+    """Numbers of the pattern by name, of a garment with styles alone; in the middle of their range without."""
 
 
 def run(
@@ -75,7 +68,7 @@ def run(
     """Animate a garment.
 
     Args:
-        model: what `fit` wrote.
+        model: what `fit` wrote, or `fit-styles`.
         poses: a motion file; resampled to the model's frame rate, or written at `config.fps`.
         output: work folder; gets body/ and registration/.
         device: of the LSTM.
@@ -83,7 +76,11 @@ def run(
         InputError: a file is damaged, or would be written over; the poses or the body are of another skeleton, or
             numbers are not finite.
     """
-    require_apart(_motion_files(output), [poses, wearer.body])
+    require_apart(motion_files(output), [poses, wearer.body])
+    if (model / STYLES_MODEL).is_file():
+        return _run_styled(model, poses, output, config, wearer, workers=workers, overwrite=overwrite)
+    if wearer.style is not None:
+        raise InputError("style: expected a garment with styles, which fit-styles learns, found another", where=model)
     known, name = _model(model, config, device)
     scene = _scene(known, poses, wearer, config)
     digest = file_digest(regressor_files(known.folder, name), root=known.folder)
@@ -96,6 +93,21 @@ def run(
         coefficients = regressor.predict(control_vectors(regressor.layout, scene.motion))
         write_npy(path, coefficients)
     return _animate(stage, scene, coefficients, config, workers)
+
+
+def _run_styled(
+    model: Path, poses: Path, output: Path, config: AnimateConfig, wearer: Wearer, *, workers: int, overwrite: bool
+) -> StageResult:
+    # torch takes a second to load
+    from retarget.animation.styled import run as styled
+
+    if wearer.body is not None:
+        raise InputError("--body: expected none, for a garment with styles is worn on its own body", where=model)
+    _require_no_take(output)
+    return styled(
+        model, poses, output, config,
+        beta=tuple(wearer.beta or ()), style=wearer.style or {}, workers=workers, overwrite=overwrite,
+    )  # fmt: skip
 
 
 def run_on_coefficients(
@@ -111,7 +123,7 @@ def run_on_coefficients(
 ) -> StageResult:
     """`run` with coefficients of the motion's frames, at the model's rate, instead of a regressor's: a take's own
     projections, or edited ones."""
-    require_apart(_motion_files(output), [poses, wearer.body])
+    require_apart(motion_files(output), [poses, wearer.body])
     known = load_garment_model(model, with_lstm=False)
     scene = _scene(known, poses, wearer, config)
     expected = (len(scene.motion.frame_ids), len(known.model.std))
@@ -217,8 +229,7 @@ def _open(output: Path, scene: _Scene, config: AnimateConfig, regressor: str, ov
     Args:
         regressor: digest of what the coefficients come from.
     """
-    if (output / "body" / "stage.json").is_file():
-        raise InputError("expected a folder for the animation alone, found a take with a tracked body", where=output)
+    _require_no_take(output)
     stage = open_stage(
         output / "registration",
         name=ANIMATE,
@@ -228,30 +239,18 @@ def _open(output: Path, scene: _Scene, config: AnimateConfig, regressor: str, ov
         sources=scene.sources,
         overwrite=overwrite,
     )
-    body, poses = _motion_files(output)
+    body, poses = motion_files(output)
     save_body(body, scene.person.body)
     save_poses(poses, scene.shown)
     return stage
 
 
-def _motion_files(output: Path) -> tuple[Path, Path]:
-    """Who moves, and how."""
-    return output / "body" / "body.npz", output / "body" / "poses.npz"
+def _require_no_take(output: Path) -> None:
+    if (output / "body" / "stage.json").is_file():
+        raise InputError("expected a folder for the animation alone, found a take with a tracked body", where=output)
 
 
 # --- frames ------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Motion:
-    """What all frames are made from, and where they are written."""
-
-    stage: Stage
-    poses: PoseSequence
-    coefficients: Float32[np.ndarray, "frames shapes"]
-    distances_deg: Float64[np.ndarray, " frames"]
-    """To the nearest pose that was learned."""
-    unlike_deg: float
 
 
 def _animate(
@@ -273,64 +272,16 @@ def _animate(
     rows = [row for row, frame_id in enumerate(frame_ids) if frame_id in pending]
     chunks = [tuple(rows[start : start + FRAMES_AT_ONCE]) for start in range(0, len(rows), FRAMES_AT_ONCE)]
     unlike = max(config.unlike_deg, known.limits.poses.validated_deg)
-    shared = _Motion(stage, motion, coefficients, known.limits.poses.distances(motion), unlike)
-    write = partial(_write_frames, shared)
+    shared = FrameFiles(stage, motion, known.limits.poses.distances(motion), unlike)
+    write = partial(_write_frames, shared, coefficients)
     prepare = partial(Animator, known.model, scene.person, scene.mean, config)
     for _ in run_jobs(write, chunks, prepare=prepare, workers=workers, label="animate", units=len):
         pass
-    return _collect(stage, frame_ids)
+    return collect(stage, frame_ids)
 
 
-def _write_frames(shared: _Motion, animator: Animator, rows: Sequence[int]) -> None:
-    for row, frame in zip(rows, animator.frames(shared.poses, shared.coefficients, rows), strict=True):
-        _write_frame(shared, row, frame)
-
-
-def _write_frame(shared: _Motion, row: int, frame: AnimatedFrame) -> None:
-    """Metrics first: the frame counts as done once its npz is there."""
-    stage, removed = shared.stage, frame.removed
-    flipped_percent = 100.0 * float(removed.flipped.mean()) if len(removed.flipped) else 0.0
-    frame_id, distance_deg = int(shared.poses.frame_ids[row]), float(shared.distances_deg[row])
-    reasons = []
-    torn = not frame.stretch_p99 <= STRETCH_FAIL
-    if not frame.stretch_p99 <= STRETCH_CHECK:
-        limit = STRETCH_FAIL if torn else STRETCH_CHECK
-        reasons.append(f"edges {frame.stretch_p99:.3g} times as long as the template's > {limit:g}")
-    if distance_deg > shared.unlike_deg:
-        reasons.append(f"pose {distance_deg:.0f} deg from every pose that was learned > {shared.unlike_deg:.0f}")
-    if removed.after.inside_percent > INSIDE_CHECK_PERCENT:
-        reasons.append(f"inside the body {removed.after.inside_percent:.2f} % > {INSIDE_CHECK_PERCENT:g} %")
-    if flipped_percent > FLIPPED_CHECK_PERCENT:
-        reasons.append(f"faces turned against the body {flipped_percent:.2f} % > {FLIPPED_CHECK_PERCENT:g} %")
-    record: dict[str, Any] = {
-        "frame_id": frame_id,
-        "verdict": "failed" if torn else "check" if reasons else "good",
-        "reasons": reasons,
-        "pose_distance_deg": distance_deg,
-        "unlike_deg": shared.unlike_deg,
-        "inside_before_percent": removed.before.inside_percent,
-        "depth_before_mm": removed.before.depth_max_mm,
-        "inside_body_percent": removed.after.inside_percent,
-        "depth_mm": removed.after.depth_max_mm,
-        "overlap_percent": removed.after.overlap_percent,
-        "removal_moved_mm": removed.rest_moved_mm,
-        "stretch_p99": frame.stretch_p99,
-        "flipped_faces": int(removed.flipped.sum()),
-    }
-    write_json(stage.frame_path(frame_id, ".json", folder="metrics"), record)
-    write_npz(
-        stage.frame_path(frame_id),
-        vertices=frame.vertices,
-        residual_m=np.full(len(frame.vertices), np.nan, np.float32),
-        verdict=np.uint8(VERDICTS.index(record["verdict"])),
-    )
-
-
-def _collect(stage: Stage, frame_ids: Sequence[int]) -> StageResult:
-    stack_vertices(stage, frame_ids)
-    records = [read_json(stage.frame_path(frame_id, ".json", folder="metrics")) for frame_id in frame_ids]
-    write_json_lines(stage.path / "metrics.jsonl", records)
-    frames = [stage.frame_path(frame_id) for frame_id in frame_ids]
-    outputs = [stage.path / "garment.npz", stage.path / "vertices.npy", *frames]
-    failed = {each["frame_id"]: "; ".join(each["reasons"]) for each in records if each["verdict"] == "failed"}
-    return stage.finish(outputs, frames=len(frame_ids), failed=failed)
+def _write_frames(
+    shared: FrameFiles, coefficients: Float32[np.ndarray, "frames shapes"], animator: Animator, rows: Sequence[int]
+) -> None:
+    for row, frame in zip(rows, animator.frames(shared.poses, coefficients, rows), strict=True):
+        write_frame(shared, row, frame)

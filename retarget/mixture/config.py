@@ -7,6 +7,9 @@ from typing import Annotated, Literal
 
 from capture4d.settings import Count, NonNegative, Part, Positive, Range, Seed, settings
 
+MODEL = "styles.safetensors"
+"""A learned garment, in its folder."""
+
 __all__ = [
     "PRESETS",
     "CanonicalConfig",

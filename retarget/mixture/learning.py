@@ -30,6 +30,7 @@ from retarget.mixture.prototype_weights import (
 )
 from retarget.mixture.styled_garment import Canonical, StyledGarment
 from retarget.mixture.training import Examples, Trained, Trainer, said_by
+from retarget.regression.known_range import PoseRange, nearest_poses, pose_quaternions
 
 __all__ = ["Learned", "learn_styles"]
 
@@ -86,7 +87,7 @@ class _Learning:
         lesson = self.lesson
         garment = StyledGarment(
             lesson.garment, lesson.body, lesson.ranges, self.pose, canonical, method(canonical),
-            self.config.over == "drape",
+            self.config.over == "drape", self._known_poses(),
         )  # fmt: skip
         return garment, self.note, self.history
 
@@ -98,6 +99,15 @@ class _Learning:
             count = max(count, 1)
         rng = np.random.default_rng([self.config.seed, 11])
         return {int(pose) for pose in rng.choice(poses, count, replace=False)}
+
+    def _known_poses(self) -> PoseRange:
+        """The learned poses, each once, and how far those that chose the epoch were from the others."""
+        poses, first = np.unique(np.concatenate([pair.poses[rows] for pair, rows in self.seen]), return_index=True)
+        rotations = np.concatenate([pair.rotations[rows] for pair, rows in self.seen])[first]
+        quaternions = pose_quaternions(rotations, self.pose.joints)
+        checked = np.isin(poses, sorted(self.checked_poses))
+        distances, _ = nearest_poses(quaternions[checked], quaternions[~checked])
+        return PoseRange(quaternions, self.pose.joints, float(np.percentile(distances, 95)) if checked.any() else 0.0)
 
     def _checked(self, pair: PairDrapes, rows: Bool[np.ndarray, " drapes"]) -> Bool[np.ndarray, " drapes"]:
         return rows & np.isin(pair.poses, sorted(self.checked_poses))

@@ -23,16 +23,17 @@ from capture4d.files.records import load_body, load_garment, save_body, save_gar
 from capture4d.files.tensors import TensorFile, read_tensors, write_tensors
 from capture4d.learning.checkpoints import filled
 from capture4d.value_checks import require_array, require_finite
-from retarget.mixture.config import NetworkConfig
+from retarget.mixture.config import MODEL, NetworkConfig
 from retarget.mixture.heads import Head, PoseNumbers
 from retarget.mixture.kernel_ridge import KernelRidge
 from retarget.mixture.predictors import Ensemble, Mixture, Predictor
 from retarget.mixture.styled_garment import Canonical, StyledGarment
 from retarget.mixture.training import made_network
+from retarget.regression.known_range import PoseRange
 
-__all__ = ["MODEL", "load_styled_garment", "save_styled_garment"]
+__all__ = ["MODEL_FILES", "load_styled_garment", "save_styled_garment"]
 
-MODEL = "styles.safetensors"
+MODEL_FILES = ("garment.npz", "body.npz", MODEL)
 KIND = "a garment with styles"
 
 
@@ -40,13 +41,18 @@ def save_styled_garment(folder: Path, garment: StyledGarment) -> list[Path]:
     """Write a garment into a folder; the files, in the order in which they were written."""
     save_garment(folder / "garment.npz", garment.garment)
     save_body(folder / "body.npz", garment.body)
-    tensors: dict[str, np.ndarray] = {"pose.mean": garment.pose.mean, "pose.scale": garment.pose.scale}
+    tensors: dict[str, np.ndarray] = {
+        "pose.mean": garment.pose.mean,
+        "pose.scale": garment.pose.scale,
+        "learned": garment.learned.quaternions,
+    }
     note: dict[str, Any] = {
         "style": [[name, low, high] for name, (low, high) in garment.ranges.style.items()],
         "shape": [[low, high] for low, high in garment.ranges.shape],
         "pose": garment.pose.kind,
         "joints": list(garment.pose.joints),
         "over_drape": garment.over_drape,
+        "validated_deg": garment.learned.validated_deg,
         "networks": {},
         "kernels": {},
         "heads": {},
@@ -93,7 +99,9 @@ def load_styled_garment(folder: Path) -> StyledGarment:
         mean = _array(file, "a_pose.mean", (count, 3))
         canonical = Canonical(_regression(file, "a_pose", ranges.size, 3 * count), mean)
         predictor = _predictor(file, count, (len(pose.mean), told))
-        return StyledGarment(garment, body, ranges, pose, canonical, predictor, _flag(file, "over_drape"))
+        return StyledGarment(
+            garment, body, ranges, pose, canonical, predictor, _flag(file, "over_drape"), _learned(file, pose.joints)
+        )
 
 
 # --- pieces ------------------------------------------------------------------------------------------------------
@@ -170,6 +178,16 @@ def _pose(file: TensorFile, joints: int) -> PoseNumbers:
     if (scale <= 0).any():
         raise InputError("pose.scale: expected positive numbers, found others")
     return PoseNumbers(chosen, "matrices" if kind == "matrices" else "axis-angle", mean, scale)
+
+
+def _learned(file: TensorFile, joints: tuple[int, ...]) -> PoseRange:
+    quaternions, validated = file["learned"], number(file.entry("validated_deg"), "validated_deg")
+    require_array("model", "learned", quaternions, (None, len(joints), 4), np.float32)
+    if (np.abs(np.linalg.norm(quaternions.astype(np.float64), axis=2) - 1) > 1e-3).any():
+        raise InputError("learned: expected unit quaternions, found others")
+    if validated < 0:
+        raise InputError(f"validated_deg: expected no less than 0, found {validated:g}")
+    return PoseRange(quaternions, joints, validated)
 
 
 def _head(file: TensorFile, name: str, count: int) -> Head:

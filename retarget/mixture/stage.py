@@ -21,12 +21,12 @@ from retarget.mixture.config import StylesConfig
 from retarget.mixture.evaluation import measure, unposed_by
 from retarget.mixture.learning import learn_styles
 from retarget.mixture.lesson import style_lesson
-from retarget.mixture.model_files import MODEL, save_styled_garment
+from retarget.mixture.model_files import MODEL_FILES, save_styled_garment
 
 __all__ = ["run"]
 
 SCHEMA = 1
-FILES = ("garment.npz", "body.npz", MODEL, "errors.json")
+FILES = (*MODEL_FILES, "errors.json")
 
 
 def run(styles: Path, output: Path, config: StylesConfig, *, workers: int = 1, overwrite: bool = False) -> StageResult:

@@ -9,30 +9,28 @@ References: TailorNet (CVPR 2020), equations 3, 4 and 8.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64
+from jaxtyping import Float, Float32, Float64, Int32
 from torch import nn
 
 from capture4d.body.limbs import WornBody
-from capture4d.body.skinning import ShapedBody, skin, with_pose, with_shape
+from capture4d.body.skinning import PosedBody, ShapedBody, skin, with_pose, with_shape
 from capture4d.captures.drapes.style_sets import Ranges
 from capture4d.errors import InputError
-from capture4d.geometry.intersection_removal import IntersectionRemoval
+from capture4d.geometry.intersection_removal import IntersectionRemoval, Removed
 from capture4d.geometry.mesh import edge_lengths, unique_edges
 from capture4d.types import Body, Garment, PoseSequence
-from retarget.config import RemovalConfig
+from retarget.config import AnimateConfig
 from retarget.mixture.heads import PoseNumbers
 from retarget.mixture.kernel_ridge import KernelRidge
 from retarget.mixture.lesson import person_under
 from retarget.mixture.predictors import Predictor
 from retarget.mixture.training import said_by
+from retarget.regression.known_range import PoseRange
 
 __all__ = ["Canonical", "StyledGarment", "WornGarment"]
-
-LONGEST = 1.15
-"""Edges are drawn together to this many times their length in the A-pose when cloth is taken out of the body."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +63,8 @@ class StyledGarment:
     predictor: Predictor
     over_drape: bool
     """Displacements are over the garment in the A-pose, not over the body."""
-    removal: RemovalConfig = field(default_factory=RemovalConfig)
+    learned: PoseRange
+    """The poses that it was learned from."""
 
     def vertices(
         self,
@@ -96,19 +95,24 @@ class StyledGarment:
         return np.stack(found) if found else np.zeros((0, len(self.garment.template.vertices), 3), np.float32)
 
     def worn(
-        self, beta: Sequence[float] | Float[np.ndarray, " betas"] = (), style: Mapping[str, float] | None = None
+        self,
+        beta: Sequence[float] | Float[np.ndarray, " betas"] = (),
+        style: Mapping[str, float] | None = None,
+        config: AnimateConfig | None = None,
     ) -> WornGarment:
         """The garment of a style on a person, with everything computed once that frames share.
 
+        Args:
+            config: how cloth is taken out of the body (`removal`) and its edges kept (`longest`).
         Raises:
             InputError: style or shape are outside what was learned.
         """
         unknown = [name for name in style or {} if name not in self.ranges.style]
         if unknown:
             raise InputError(f"style: expected {', '.join(self.ranges.style)}, found '{unknown[0]}'")
-        return WornGarment(
-            self, self.ranges.numbers(style or {}, beta), with_shape(self.body, np.asarray(beta, np.float64))
-        )
+        numbers = self.ranges.numbers(style or {}, beta)
+        person = with_shape(self.body, np.asarray(beta, np.float64))
+        return WornGarment(self, numbers, person, config or AnimateConfig())
 
 
 class WornGarment:
@@ -118,8 +122,15 @@ class WornGarment:
         numbers: style and shape, from -1 to 1.
     """
 
-    def __init__(self, garment: StyledGarment, numbers: Float64[np.ndarray, " numbers"], person: ShapedBody) -> None:
-        self._garment, self._numbers, self._person = garment, numbers, person
+    def __init__(
+        self,
+        garment: StyledGarment,
+        numbers: Float64[np.ndarray, " numbers"],
+        person: ShapedBody,
+        config: AnimateConfig,
+    ) -> None:
+        self.person = person
+        self._garment, self._numbers, self._config = garment, numbers, config
         self._under = person_under(garment.garment, garment.body, np.asarray(person.shape, np.float32))
         self._canonical = garment.canonical(numbers)
         self._contact: tuple[IntersectionRemoval, WornBody] | None = None
@@ -128,6 +139,10 @@ class WornGarment:
     def in_a_pose(self) -> Float64[np.ndarray, "verts 3"]:
         """The garment at rest in the A-pose, which is the body's rest pose, metres."""
         return self._under + self._canonical
+
+    @property
+    def faces(self) -> Int32[np.ndarray, "faces 3"]:
+        return self._garment.garment.template.faces
 
     def unposed(self, rotations: Float[np.ndarray, "frames joints 3 3"]) -> Float64[np.ndarray, "frames verts 3"]:
         """The garment in some poses, as it is without them, metres."""
@@ -145,22 +160,30 @@ class WornGarment:
     ) -> Iterator[Float32[np.ndarray, "verts 3"]]:
         """The garment in one pose after the other, as they come, metres; rotations and the root's translation."""
         for rotations, translation in poses:
-            body = with_pose(self._person, rotations, translation)
-            weights = self._garment.garment.skin_weights
-            assert weights is not None
-            vertices = skin(self.unposed(rotations[None])[0], weights, body.transforms)
             if remove_intersections:
-                removal, worn = self._contacts()
-                vertices = removal(vertices, worn.posed(body.vertices())).vertices
+                vertices = self.outside(rotations, translation).vertices
+            else:
+                vertices = self._placed(with_pose(self.person, rotations, translation))
             yield vertices.astype(np.float32)
+
+    def outside(self, rotations: Float[np.ndarray, "joints 3 3"], translation: Float[np.ndarray, "3"]) -> Removed:
+        """The garment in a pose, out of the body, and how it came out."""
+        body = with_pose(self.person, rotations, translation)
+        removal, worn = self._contacts()
+        return removal(self._placed(body), worn.posed(body.vertices()))
+
+    def _placed(self, body: PosedBody) -> Float64[np.ndarray, "verts 3"]:
+        weights = self._garment.garment.skin_weights
+        assert weights is not None
+        return skin(self.unposed(np.asarray(body.rotations)[None])[0], weights, body.transforms)
 
     def _contacts(self) -> tuple[IntersectionRemoval, WornBody]:
         """What takes it out of the body; made when it is first needed."""
         if self._contact is None:
-            garment, at_rest = self._garment.garment, self.in_a_pose
+            garment, at_rest, config = self._garment.garment, self.in_a_pose, self._config
             assert garment.skin_weights is not None
-            faces = garment.template.faces
-            lengths = edge_lengths(at_rest, unique_edges(faces))
-            removal = IntersectionRemoval(faces, len(at_rest), lengths, LONGEST, self._garment.removal)
-            self._contact = removal, WornBody(self._person, at_rest, garment.skin_weights)
+            lengths = edge_lengths(at_rest, unique_edges(self.faces))
+            longest = config.longest or np.inf
+            removal = IntersectionRemoval(self.faces, len(at_rest), lengths, longest, config.removal)
+            self._contact = removal, WornBody(self.person, at_rest, garment.skin_weights)
         return self._contact

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +13,7 @@ from tyro.conf import Positional, arg
 from capture4d.cli.exit_codes import GOOD
 from capture4d.cli.options import GradedOptions, MeshOptions, StageOptions
 from capture4d.cli.verdict import say_verdict
-from capture4d.errors import CommandLineError
+from capture4d.errors import CommandLineError, InputError
 from capture4d.settings import Number
 from retarget.config import AnimateConfig, FitConfig
 from retarget.mixture import config as mixture_config
@@ -55,7 +56,8 @@ class Animate(GradedOptions):
     """Put a learned garment on a motion, and on another body: a sequence like a registered one."""
 
     model: Annotated[Positional[Path], arg(metavar="MODEL")]
-    """What `fit` wrote: WORK, WORK/retarget, or the blendshapes.safetensors in it."""
+    """What `fit` wrote: WORK, WORK/retarget, or the blendshapes.safetensors in it; or the folder that `fit-styles`
+    wrote."""
     poses: Path
     """Motion file, .npz or .bvh."""
     output: Path
@@ -64,6 +66,8 @@ class Animate(GradedOptions):
     """Another person, a body.npz of the same faces and joints."""
     beta: tuple[Number, ...] | None = None
     """Shape of the person, in standard deviations; the captured person without --body and --beta."""
+    styles: Annotated[tuple[str, ...], arg(name="style")] = ()
+    """Numbers of the pattern, NAME=VALUE each, for a garment with styles; in the middle of their range without."""
     device: str = "cpu"
     """Where torch computes, such as cpu or cuda."""
     config: Annotated[AnimateConfig, arg(name="")] = field(default_factory=AnimateConfig)
@@ -78,7 +82,7 @@ class Animate(GradedOptions):
             self.poses,
             self.output,
             self.config,
-            wearer=Wearer(self.body, self.beta),
+            wearer=Wearer(self.body, self.beta, _numbers(self.styles) if self.styles else None),
             device=self.device,
             workers=self.workers,
             overwrite=self.overwrite,
@@ -90,6 +94,20 @@ class Animate(GradedOptions):
             first = f"frame {doubtful[0]['frame_id']}: {'; '.join(doubtful[0]['reasons'])}"
             print(f"capture4d: {len(doubtful)} of {result.frames} frames are to be checked; {first}", file=sys.stderr)
         return self.graded(result)
+
+
+def _numbers(texts: tuple[str, ...]) -> dict[str, float]:
+    """NAME=VALUE texts as numbers by name."""
+    found = {}
+    for text in texts:
+        name, sign, value = text.partition("=")
+        try:
+            found[name] = float(value)
+        except ValueError:
+            sign = ""
+        if not sign or not math.isfinite(found[name]):
+            raise InputError(f"--style: expected NAME=VALUE, a number, found {text!r}")
+    return found
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -55,16 +55,10 @@ def pose_displacement(garment: Garment, angle: float, style: float) -> np.ndarra
     return bulge + wave
 
 
-@pytest.fixture(scope="session")
-def body() -> Body:
-    return _body()
-
-
-@pytest.fixture(scope="session")
-def garment() -> Garment:
+def _garment(body: Body) -> Garment:
+    """A tube around it, bound to the nearest faces."""
     mesh = tube(AROUND, ALONG, radius=0.12, height=0.7, start=0.05)
     bend = np.clip((mesh.vertices[:, 1] - 0.3) / 0.2, 0, 1)
-    body = _body()
     nearest = np.argmin(
         np.linalg.norm(mesh.vertices[:, None] - body.template.vertices[body.template.faces].mean(axis=1), axis=2),
         axis=1,
@@ -103,8 +97,14 @@ def _pair(name: str, style: float, shape: float, garment: Garment, body: Body, a
 
 
 @pytest.fixture(scope="session")
-def style_set(body: Body, garment: Garment) -> StyleSet:
+def style_set() -> StyleSet:
+    return made_style_set()
+
+
+def made_style_set() -> StyleSet:
     """Four prototypes at the corners, two test pairs; three unseen poses."""
+    body = _body()
+    garment = _garment(body)
     corners = [(style, shape) for style in (0.4, 0.8) for shape in (-1.0, 1.0)]
     tests = [(0.5, 0.5), (0.65, -0.3)]
     angles = np.concatenate([[0.35, 0.75, 1.1], np.linspace(0, 1.3, 14)])

@@ -1,0 +1,120 @@
+"""A garment with styles on a motion: what `retarget.animation.stage` does with a model that `fit-styles` wrote.
+
+The output is that of any animation. The garment of a pose depends on nothing that went before it, so that a motion
+keeps its own frame rate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from capture4d.captures.work_folder import ANIMATE
+from capture4d.errors import InputError
+from capture4d.files.atomic import file_digest
+from capture4d.files.records import save_body, save_garment, save_poses
+from capture4d.geometry.mesh import edge_lengths, edge_stretch, stretch_p99, unique_edges
+from capture4d.motions.motion_files import rate_note, read_motion, resample, same_rate, told
+from capture4d.runs.stage import StageResult, open_stage
+from capture4d.runs.workers import run_jobs
+from capture4d.types import PoseSequence
+from retarget.animation.animator import FRAMES_AT_ONCE, AnimatedFrame
+from retarget.animation.frame_files import SCHEMA, FrameFiles, collect, motion_files, write_frame
+from retarget.config import AnimateConfig
+from retarget.mixture.model_files import MODEL_FILES, load_styled_garment
+from retarget.mixture.styled_garment import StyledGarment, WornGarment
+
+__all__ = ["run"]
+
+
+def run(
+    model: Path,
+    poses: Path,
+    output: Path,
+    config: AnimateConfig,
+    *,
+    beta: Sequence[float],
+    style: Mapping[str, float],
+    workers: int,
+    overwrite: bool,
+) -> StageResult:
+    """Animate a garment with styles.
+
+    Args:
+        beta, style: of `StyledGarment.worn`.
+    Raises:
+        InputError: a file is damaged, the poses are of another skeleton, or style or shape are outside what was
+            learned.
+    """
+    for name, usual in (("regressor", "auto"), ("mean", "corrected")):
+        if getattr(config, name) != usual:
+            raise InputError(f"--{name}: expected none, for a garment with styles has none to choose")
+    known = load_styled_garment(model)
+    worn = known.worn(beta, style, config)
+    motion = _motion(known, poses, worn, config.fps)
+    files = [model / name for name in MODEL_FILES]
+    stage = open_stage(
+        output / "registration",
+        name=ANIMATE,
+        schema=SCHEMA,
+        config={**asdict(config), "beta": [*map(float, beta)], "style": dict(style)},
+        upstream={"model": file_digest(files, root=model), "poses": file_digest([poses], root=poses.parent)},
+        sources={"model": model, "poses": poses},
+        overwrite=overwrite,
+    )
+    body_path, poses_path = motion_files(output)
+    save_body(body_path, known.body)
+    save_poses(poses_path, motion)
+    template = known.garment.template.with_vertices(worn.in_a_pose.astype(np.float32))
+    save_garment(stage.path / "garment.npz", replace(known.garment, template=template, body_shape=motion.shape))
+    frame_ids = [int(frame_id) for frame_id in motion.frame_ids]
+    pending = set(stage.pending(frame_ids))
+    rows = [row for row, frame_id in enumerate(frame_ids) if frame_id in pending]
+    chunks = [tuple(rows[start : start + FRAMES_AT_ONCE]) for start in range(0, len(rows), FRAMES_AT_ONCE)]
+    unlike = max(config.unlike_deg, known.learned.validated_deg)
+    shared = FrameFiles(stage, motion, known.learned.distances(motion), unlike)
+    prepare = partial(_worn, model, beta, style, config)
+    for _ in run_jobs(
+        partial(_write_frames, shared), chunks, prepare=prepare, workers=workers, label="animate", units=len
+    ):
+        pass
+    return collect(stage, frame_ids)
+
+
+def _motion(known: StyledGarment, path: Path, worn: WornGarment, fps: float | None) -> PoseSequence:
+    """The motion on the person, at its own rate or at the wanted one."""
+    say = told(path)
+    found = read_motion(path, known.body, say=say)
+    if found.joint_names != known.body.joint_names or not len(found.frame_ids):
+        raise InputError(
+            f"expected frames of the {len(known.body.joint_names)} joints of the model, found {len(found.frame_ids)} "
+            f"of {len(found.joint_names)}",
+            where=path,
+        )
+    found = replace(found, shape=np.asarray(worn.person.shape, np.float32))
+    if fps is None or same_rate(fps, found.fps):
+        return found
+    try:
+        shown = resample(found, fps)
+    except InputError as error:
+        raise error.at(path) from None
+    say(rate_note(found.fps, len(found.frame_ids), shown.fps, len(shown.frame_ids), whose=""))
+    return shown
+
+
+def _worn(model: Path, beta: Sequence[float], style: Mapping[str, float], config: AnimateConfig) -> WornGarment:
+    """The garment on the person, for a process."""
+    return load_styled_garment(model).worn(beta, style, config)
+
+
+def _write_frames(shared: FrameFiles, worn: WornGarment, rows: Sequence[int]) -> None:
+    edges, at_rest = unique_edges(worn.faces), worn.in_a_pose
+    lengths = edge_lengths(at_rest, edges)
+    for row in rows:
+        removed = worn.outside(shared.poses.rotations[row], shared.poses.translations[row])
+        stretch = stretch_p99(edge_stretch(removed.vertices, edges, lengths))
+        write_frame(shared, row, AnimatedFrame(removed.vertices.astype(np.float32), removed, stretch))
