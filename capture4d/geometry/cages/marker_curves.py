@@ -5,8 +5,8 @@ minimise the bending energy, the integral of |x''|^2 ds, as a cubic spline does,
 
     w sum over segments of ((length of the curve - length of cloth) / length of cloth)^2
 
-with a weight that grows until it decides. Where markers are farther apart than the cloth is long between them, or two
-taut segments meet at an angle, lengths cannot be kept, and the curve comes as near as a smooth one can.
+with a weight that grows until it decides. Where markers are farther apart than the cloth is long between them it is
+stretched: such a segment has no length to keep, and counts with that of its chord.
 
 Letters: M markers, S segments (M - 1, or M of a closed curve), N vertices of a curve.
 
@@ -45,6 +45,8 @@ class MarkerCurve:
     """The markers; of a closed curve the first once more at the end."""
     tangents: Float64[np.ndarray, "knots 3"]
     """dx/ds at the markers."""
+    spans: Float64[np.ndarray, " S"]
+    """Of the parameter between neighbouring markers: the length of cloth, or the chord of what is stretched."""
     arc: Float64[np.ndarray, " knots"]
     """Length of cloth from the first marker, metres."""
 
@@ -53,16 +55,16 @@ class MarkerCurve:
         segment = np.clip(np.searchsorted(self.arc, arc, side="right") - 1, 0, len(self.arc) - 2)
         span = np.diff(self.arc)[segment]
         blend = _hermite((arc - self.arc[segment]) / span)
-        return np.einsum("kn,knc->nc", blend, self._controls(segment, span))
+        return np.einsum("kn,knc->nc", blend, self._controls(segment))
 
     def lengths(self) -> Float64[np.ndarray, " S"]:
         """Of the curve between neighbouring markers, metres."""
-        controls = self._controls(np.arange(len(self.arc) - 1), np.diff(self.arc))
+        controls = self._controls(np.arange(len(self.spans)))
         return _Segments.speeds(controls)[1]
 
-    def _controls(self, segment: np.ndarray, span: np.ndarray) -> np.ndarray:
+    def _controls(self, segment: np.ndarray) -> np.ndarray:
         """Start, its tangent, end, its tangent of segments, (4, N, 3)."""
-        first, second = self.tangents[segment], self.tangents[segment + 1]
+        first, second, span = self.tangents[segment], self.tangents[segment + 1], self.spans[segment]
         return np.stack([self.points[segment], span[:, None] * first, self.points[segment + 1], span[:, None] * second])
 
 
@@ -90,9 +92,10 @@ def curve_through(
     if not (np.isfinite(points).all() and (wanted > 0).all()):
         raise InputError("markers: expected finite places and positive lengths between them")
     knots = np.concatenate([points, points[:1]]) if closed else points
-    segments = _Segments(knots, wanted, closed)
+    chords = np.linalg.norm(np.diff(knots, axis=0), axis=1)
+    segments = _Segments(knots, np.maximum(wanted, chords), wanted > chords, closed)
     tangents = segments.spline()
-    slack = float(np.clip(1 - np.linalg.norm(np.diff(knots, axis=0), axis=1) / wanted, 0, 1).mean())
+    slack = float(np.clip(1 - chords / wanted, 0, 1).mean())
     signs = np.where(np.arange(len(tangents)) % 2 == 0, 1.0, -1.0)[:, None]
     nudge = NUDGE * np.sqrt(6 * slack) * signs * _across(normalised(np.diff(knots, axis=0)), bow)
     for weight in WEIGHTS:
@@ -104,7 +107,7 @@ def curve_through(
         )
         tangents = found.x.reshape(-1, 3)
     every = np.concatenate([tangents, tangents[:1]]) if closed else tangents
-    return MarkerCurve(knots, every, np.concatenate([[0.0], np.cumsum(wanted)]))
+    return MarkerCurve(knots, every, np.maximum(wanted, chords), np.concatenate([[0.0], np.cumsum(wanted)]))
 
 
 def fill_curve(
@@ -155,8 +158,8 @@ def _nodes(count: int) -> tuple[np.ndarray, np.ndarray]:
 class _Segments:
     """Bending and lengths of a curve as functions of its tangents."""
 
-    def __init__(self, knots: np.ndarray, lengths: np.ndarray, closed: bool) -> None:
-        self.knots, self.wanted = knots, lengths
+    def __init__(self, knots: np.ndarray, lengths: np.ndarray, kept: np.ndarray, closed: bool) -> None:
+        self.knots, self.wanted, self.kept = knots, lengths, kept
         count = len(lengths)
         self.free = count if closed else count + 1
         self.first = np.arange(count)
@@ -196,7 +199,7 @@ class _Segments:
     def residuals(self, free: np.ndarray, weight: float) -> np.ndarray:
         tangents = free.reshape(-1, 3)
         bending = (self.bend @ tangents).reshape(-1) + self.bend_offset
-        return np.concatenate([bending, np.sqrt(weight) * (self._measured(tangents)[1] / self.wanted - 1)])
+        return np.concatenate([bending, np.sqrt(weight) * self.kept * (self._measured(tangents)[1] / self.wanted - 1)])
 
     def jacobian(self, free: np.ndarray, weight: float) -> np.ndarray:
         place, weights = _nodes(GAUSS)
@@ -206,7 +209,9 @@ class _Segments:
         for end, basis in ((self.first, 1), (self.second, 3)):  # d length / d T, over the length of cloth
             np.add.at(lengths, (self.first, end), np.einsum("q,qsc->sc", weights * slopes[basis], directions))
         bending = np.kron(self.bend, np.eye(3))
-        return np.concatenate([bending, np.sqrt(weight) * lengths.reshape(len(lengths), -1)])
+        return np.concatenate(
+            [bending, np.sqrt(weight) * (self.kept[:, None, None] * lengths).reshape(len(lengths), -1)]
+        )
 
 
 def _across(chords: np.ndarray, bow: np.ndarray | None) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Drawn offsets: only differences count, so that nothing touched is nothing changed, whatever a program does besides."""
+"""Drawn offsets: only differences count: what nobody touched does not change, whatever a program does besides."""
 
 from __future__ import annotations
 
