@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -29,6 +30,7 @@ from registration.alignment import align, fit_similarity
 from registration.approach import approach, spread_evenly
 from registration.config import MeshRegistrationConfig, RegistrationConfig, ScanFitConfig
 from registration.correspondences import mesh_normals
+from registration.geodesic_signature import geodesic_signatures, levelled
 from registration.quality import FrameQuality, assess, scan_distances
 from registration.register import FrameScan, prepare_frame, register_frame
 from registration.template import TemplateAnalysis, analyse_template
@@ -37,6 +39,7 @@ __all__ = ["Landmarks", "MeshFit", "fit_mesh", "judge"]
 
 Landmarks = tuple[Int64[np.ndarray, " marks"], Float64[np.ndarray, "marks 3"]]
 """Template vertices, and their places on the scan."""
+Signatures = tuple[Float64[np.ndarray, "verts quantiles"], Float64[np.ndarray, "points quantiles"]]
 
 NORMAL_LENGTH = 0.03
 """What a normal turned by 60 degrees counts as among distances, metres, when attempts are compared."""
@@ -86,6 +89,15 @@ class _Attempts:
         self.scan = prepare_frame(self.kept, scan, config.registration)
         self.made: list[_Attempt] = []
         self.fault: InputError | None = None
+
+    @cached_property
+    def signatures(self) -> Signatures | None:
+        """Of the template's vertices and of the scan's points; None where the two surfaces are not alike."""
+        surface, mesh = self.scan.surface, self.garment_scan.mesh
+        own = geodesic_signatures(self.kept.rest, self.kept.faces)
+        other = surface.of_points(geodesic_signatures(mesh.vertices, mesh.faces))
+        gap, other = levelled(own, self.kept.rest, other, surface.points)
+        return (own, other) if gap <= self.config.approach.signature_gap else None
 
     def add(self, way: str, start: np.ndarray, make: Callable[[], np.ndarray], scan: FrameScan | None = None) -> bool:
         """Make one more; whether it reaches the scan. What lies too far off for it is kept as the pair's fault.
@@ -164,13 +176,15 @@ def _keeping_lengths(tried: _Attempts, start: np.ndarray, landmarks: Landmarks |
     def near(begin: np.ndarray) -> bool:
         return tried.add("near", begin, lambda: register_frame(analysis, scan, begin, config=own).vertices)
 
-    def drawn(begin: np.ndarray, width: float) -> np.ndarray:
-        there = approach(analysis, scan.surface, begin, config.approach, first_width=width, landmarks=landmarks)
+    def drawn(begin: np.ndarray, width: float | None, told: Signatures | None) -> np.ndarray:
+        there = approach(
+            analysis, scan.surface, begin, config.approach, first_width=width, signatures=told, landmarks=landmarks
+        )
         settled = register_frame(analysis, scan, there, config=_dense_alone(config.stiff)).vertices
         return register_frame(analysis, scan, settled, config=_dense_alone(own)).vertices
 
     def far(begin: np.ndarray) -> bool:
-        return tried.add("far", begin, lambda: drawn(begin, config.approach.width[0]))
+        return tried.add("far", begin, lambda: drawn(begin, None, tried.signatures))
 
     movable = config.align == "auto" and landmarks is None
     if config.lengths == "free":
@@ -189,7 +203,7 @@ def _keeping_lengths(tried: _Attempts, start: np.ndarray, landmarks: Landmarks |
         return moved
     if tried.swung:
         start = tried.best.fit.start
-        tried.add("wide", start, lambda: drawn(start, config.approach.wider))
+        tried.add("wide", start, lambda: drawn(start, config.approach.wider, None))
         return start
     return moved
 
