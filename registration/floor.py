@@ -14,7 +14,7 @@ __all__ = ["find_floor"]
 
 SAMPLES = 4000
 TRIED = 100
-"""Places whose surroundings are tried as the plane: of a plane with a twentieth of the surface, one in 170 misses all."""
+"""Places whose surroundings are tried as the plane. All miss one with a twentieth of the surface once in 170 times."""
 AROUND_M = 0.1
 """Radius of such surroundings, of a template of 1.2 m; and how near a plane what stands on it is."""
 FLAT_M = 0.008

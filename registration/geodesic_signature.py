@@ -10,6 +10,8 @@ References: Hamza and Krim 2003 (geodesic object representation); Osada et al. 2
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from jaxtyping import Float, Float64, Int64, Integer
 from scipy import sparse
@@ -18,7 +20,7 @@ from scipy.sparse import csgraph
 from registration.approach import spread_evenly
 from registration.correspondences import mesh_normals
 
-__all__ = ["geodesic_signatures", "levelled"]
+__all__ = ["Likeness", "geodesic_signatures", "likeness"]
 
 PATCH_M = 0.02
 """Edge of the cells that patches are cut by, of a template of 1.2 m; half of it changes nothing but the time."""
@@ -45,18 +47,32 @@ def geodesic_signatures(
     return np.quantile(distances, SHARES, axis=0).T[of_vertex]
 
 
-def levelled(
+@dataclass(frozen=True, slots=True, eq=False)
+class Likeness:
+    """What one surface's signatures are beside another's."""
+
+    size: float
+    """Distances along the second surface over those along the first, in the median."""
+    gap: float
+    """How differently both are distributed, once they lie in one place, metres in the mean."""
+    levelled: Float64[np.ndarray, "points quantiles"]
+    """The second surface's signatures, shifted to where the first's lie: noise and holes make every way along a scan a
+    little longer or shorter."""
+
+
+def likeness(
     own: Float64[np.ndarray, "verts quantiles"],
     own_places: Float64[np.ndarray, "verts 3"],
     other: Float64[np.ndarray, "points quantiles"],
     other_places: Float64[np.ndarray, "points 3"],
-) -> tuple[float, Float64[np.ndarray, "points quantiles"]]:
-    """How differently two surfaces' signatures are distributed, metres in the mean; and the second ones, shifted so that
-    their distribution lies where the first's does. Noise and holes make every way along a scan a little longer."""
+) -> Likeness:
+    """Compare the signatures of two surfaces, each point of which has one and a place."""
     shares = np.linspace(0.05, 0.95, 19)
     here = np.quantile(own[spread_evenly(own_places, COMPARED)], shares, axis=0)
     there = np.quantile(other[spread_evenly(other_places, COMPARED)], shares, axis=0)
-    return float(np.abs(there - here).mean()), other - np.median(there - here, axis=0)
+    shift = np.median(there - here, axis=0)
+    size = float((there[9] / np.maximum(here[9], 1e-9)).mean())
+    return Likeness(size, float(np.abs(there - here - shift).mean()), other - shift)
 
 
 def _patches(

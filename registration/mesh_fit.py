@@ -9,6 +9,7 @@ Where `align` may, and a rigid motion brings the template far nearer, both are t
 alone if nothing of the scan lies near the start. Then:
 
     wide       the same with wider votes, where limbs had to swing
+    sized      all of these with the template made larger or smaller as a whole, where distances along the scan say so
     soft       growing and shrinking, for what is another of its kind
 
 Each attempt is judged by what of the scan it leaves unreached, and what of itself away from the scan; the best counts.
@@ -30,7 +31,7 @@ from registration.alignment import align, fit_similarity
 from registration.approach import approach, spread_evenly
 from registration.config import MeshRegistrationConfig, RegistrationConfig, ScanFitConfig
 from registration.correspondences import mesh_normals
-from registration.geodesic_signature import geodesic_signatures, levelled
+from registration.geodesic_signature import Likeness, geodesic_signatures, likeness
 from registration.quality import FrameQuality, assess, scan_distances
 from registration.register import FrameScan, prepare_frame, register_frame
 from registration.template import TemplateAnalysis, analyse_template
@@ -54,8 +55,14 @@ LIES_THERE = 0.02
 """Sum of the mean distances either way, metres, below which a template lies on the scan already."""
 SWUNG = 0.85
 """Limbs had to swing where the way from afar brings the misfit down to this share of the near one's."""
+SAME_SIZE = 0.98
+"""Distances along a scan over those along the template of the same person: the median of 11 pairs (0.91 to 1.07)."""
+OTHER_GAP = 0.03
+"""Mean difference of signatures, metres, up to which the scan may show another of the template's kind."""
 BORDER_MM = 5.0
 """Mean distance of the template's open borders from the scan above which it does not end where the scan does."""
+FREE = ("sized", "soft")
+"""Ways that keep no lengths."""
 LEAST_MARKS = 3
 """Landmarks that fix a rigid motion."""
 
@@ -70,7 +77,7 @@ class MeshFit:
     analysis: TemplateAnalysis
     scan: FrameScan
     way: str
-    """near, far, wide, or soft."""
+    """near, far, wide, sized, or soft."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,13 +98,29 @@ class _Attempts:
         self.fault: InputError | None = None
 
     @cached_property
-    def signatures(self) -> Signatures | None:
-        """Of the template's vertices and of the scan's points; None where the two surfaces are not alike."""
+    def _compared(self) -> tuple[np.ndarray, Likeness]:
+        """Signatures of the template's vertices, and what those of the scan's points are beside them."""
         surface, mesh = self.scan.surface, self.garment_scan.mesh
         own = geodesic_signatures(self.kept.rest, self.kept.faces)
         other = surface.of_points(geodesic_signatures(mesh.vertices, mesh.faces))
-        gap, other = levelled(own, self.kept.rest, other, surface.points)
-        return (own, other) if gap <= self.config.approach.signature_gap else None
+        return own, likeness(own, self.kept.rest, other, surface.points)
+
+    @property
+    def signatures(self) -> Signatures | None:
+        """Of the template's vertices and of the scan's points; None where the two surfaces are not alike."""
+        own, found = self._compared
+        limits = self.config.approach
+        alike = found.gap <= limits.signature_gap and limits.signature_size[0] <= found.size <= limits.signature_size[1]
+        return (own, found.levelled) if alike else None
+
+    @property
+    def other_size(self) -> float | None:
+        """How much larger the scan is along its surface, where it seems to show another of the template's kind."""
+        found, limits = self._compared[1], self.config.approach
+        low, high = limits.signature_size
+        if low <= found.size <= high or found.gap > OTHER_GAP or not 0.7 < found.size < 1.4:
+            return None
+        return found.size / SAME_SIZE
 
     def add(self, way: str, start: np.ndarray, make: Callable[[], np.ndarray], scan: FrameScan | None = None) -> bool:
         """Make one more; whether it reaches the scan. What lies too far off for it is kept as the pair's fault.
@@ -156,12 +179,14 @@ def fit_mesh(
     elif config.align == "auto" and landmarks is not None and len(landmarks[0]) >= LEAST_MARKS:
         start = fit_similarity(start[landmarks[0]], landmarks[1], with_scale=False).apply(start)
     start = _keeping_lengths(tried, start, landmarks)
+    if config.lengths == "auto" and landmarks is None and not tried.reached:
+        _resized(tried, start)
     if config.lengths == "free" or not (tried.reached or config.lengths == "kept"):
         _freeing_lengths(tried, start)
     if not tried.made:
         assert tried.fault is not None, "an attempt is made or has a fault"
         raise tried.fault
-    kept = [attempt for attempt in tried.made if attempt.fit.way != "soft"]
+    kept = [attempt for attempt in tried.made if attempt.fit.way not in FREE]
     if not kept:
         return tried.best.fit
     closest = min(kept, key=lambda attempt: attempt.misfit)
@@ -206,6 +231,22 @@ def _keeping_lengths(tried: _Attempts, start: np.ndarray, landmarks: Landmarks |
         tried.add("wide", start, lambda: drawn(start, config.approach.wider, None))
         return start
     return moved
+
+
+def _resized(tried: _Attempts, start: np.ndarray) -> None:
+    """The template made as large as the scan as a whole, and brought there with the lengths it has then."""
+    factor = tried.other_size
+    if factor is None:
+        return
+    rest, middle = tried.kept.rest, start.mean(axis=0)
+    template = tried.garment.template.with_vertices((factor * rest).astype(np.float32))
+    own = _Attempts(replace(tried.garment, template=template), tried.garment_scan, tried.config)
+    begin = _moved_there(middle + factor * (start - middle), own.scan)
+    _keeping_lengths(own, begin, None)
+    if own.made:
+        best = own.best
+        fit = MeshFit(best.fit.vertices, best.fit.start, tried.kept, tried.scan, "sized")
+        tried.made.append(_Attempt(fit, best.misfit, best.reached))
 
 
 def _freeing_lengths(tried: _Attempts, start: np.ndarray) -> None:

@@ -260,7 +260,8 @@ def _require_one_unit(template: float, scan: float, template_name: str, scan_nam
 def _without_floor(
     scan: Mesh, colours: np.ndarray | None, start: np.ndarray, template: Mesh
 ) -> tuple[Mesh, np.ndarray | None, float]:
-    """The scan and its colours without a floor that the template does not have, and its share of the vertices, per cent."""
+    """The scan and its colours without a floor that the template does not have, and its share of the vertices in per
+    cent."""
     on_floor = find_floor(scan.vertices.astype(np.float64), scan.faces)
     if on_floor is None or find_floor(start, template.faces) is not None:
         return scan, colours, 0.0
