@@ -142,8 +142,18 @@ class _Attempts:
 
     @property
     def reached(self) -> bool:
-        """Whether the last attempt reached the scan."""
-        return bool(self.made) and self.made[-1].reached
+        """Whether an attempt has reached the scan."""
+        return any(attempt.reached for attempt in self.made)
+
+    @property
+    def of_doubtful_size(self) -> bool:
+        """Whether the scan is not reached, or from afar alone with all of the template: limbs of another person's size
+        can be folded up to lie on the scan, and half a person is no smaller one."""
+        if not self.reached or self.best.fit.way == "near":
+            return not self.reached
+        away = 1e3 * self.scan.surface.grid.query(self.best.fit.vertices)[0]
+        limits = self.config.scan_fit
+        return 100.0 * float((away > limits.far_fail_mm).mean()) <= limits.lost_check_percent
 
     @property
     def swung(self) -> bool:
@@ -179,7 +189,7 @@ def fit_mesh(
     elif config.align == "auto" and landmarks is not None and len(landmarks[0]) >= LEAST_MARKS:
         start = fit_similarity(start[landmarks[0]], landmarks[1], with_scale=False).apply(start)
     start = _keeping_lengths(tried, start, landmarks)
-    if config.lengths == "auto" and landmarks is None and not tried.reached:
+    if config.lengths == "auto" and landmarks is None and tried.of_doubtful_size:
         _resized(tried, start)
     if config.lengths == "free" or not (tried.reached or config.lengths == "kept"):
         _freeing_lengths(tried, start)
@@ -190,7 +200,9 @@ def fit_mesh(
     if not kept:
         return tried.best.fit
     closest = min(kept, key=lambda attempt: attempt.misfit)
-    return tried.best.fit if tried.best.misfit < BETTER * closest.misfit else closest.fit
+    better = {"sized": closest.misfit, "soft": BETTER * closest.misfit}  # that the size is another is known already
+    freer = [attempt for attempt in tried.made if attempt.fit.way in FREE and attempt.misfit < better[attempt.fit.way]]
+    return min(freer or [closest], key=lambda attempt: attempt.misfit).fit
 
 
 def _keeping_lengths(tried: _Attempts, start: np.ndarray, landmarks: Landmarks | None) -> np.ndarray:
