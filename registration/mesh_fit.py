@@ -59,6 +59,8 @@ SAME_SIZE = 0.98
 """Distances along a scan over those along the template of the same person: the median of 11 pairs (0.91 to 1.07)."""
 OTHER_GAP = 0.03
 """Mean difference of signatures, metres, up to which the scan may show another of the template's kind."""
+MOST_LOST = 0.2
+"""Share of the template that may be far from a scan of another size; of half a person it is half."""
 BORDER_MM = 5.0
 """Mean distance of the template's open borders from the scan above which it does not end where the scan does."""
 FREE = ("sized", "soft")
@@ -147,13 +149,12 @@ class _Attempts:
 
     @property
     def of_doubtful_size(self) -> bool:
-        """Whether the scan is not reached, or from afar alone with all of the template: limbs of another person's size
-        can be folded up to lie on the scan, and half a person is no smaller one."""
-        if not self.reached or self.best.fit.way == "near":
-            return not self.reached
+        """Whether most of the template is on the scan, which is not reached, or from afar alone: limbs of another
+        person's size can be folded up to lie on it. Half a person is no smaller one."""
+        if not self.made or (self.reached and self.best.fit.way == "near"):
+            return False
         away = 1e3 * self.scan.surface.grid.query(self.best.fit.vertices)[0]
-        limits = self.config.scan_fit
-        return 100.0 * float((away > limits.far_fail_mm).mean()) <= limits.lost_check_percent
+        return float((away > self.config.scan_fit.far_fail_mm).mean()) <= MOST_LOST
 
     @property
     def swung(self) -> bool:
