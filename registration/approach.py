@@ -6,6 +6,10 @@ nothing explains pulls at the shoulder until the template's arm has swung there.
 step, and the deformation graph loosens as it does. Template vertices that no scan point votes for, as of half a person,
 follow their neighbours.
 
+Where the two surfaces tell their points apart by distances along them (`registration.geodesic_signature`), a scan point
+votes for vertices like it alone, and for the nearest of them however far they are: a raised hand for the hand. Such
+votes fade out while the Gaussian narrows, for signatures are good to a hand's breadth.
+
 References: Myronenko and Song 2010 (coherent point drift); Sumner, Schmid, Pauly 2007 (the graph that moves).
 """
 
@@ -34,13 +38,15 @@ def approach(
     config: ApproachConfig,
     *,
     first_width: float | None = None,
+    signatures: tuple[Float64[np.ndarray, "verts q"], Float64[np.ndarray, "points q"]] | None = None,
     landmarks: tuple[Int64[np.ndarray, " marks"], Float64[np.ndarray, "marks 3"]] | None = None,
 ) -> Float64[np.ndarray, "verts 3"]:
     """Draw the template to the scan.
 
     Args:
         start: where the template lies, metres.
-        first_width: of the Gaussian, in place of the configured one, metres.
+        first_width: of the Gaussian, in place of the configured ones, metres.
+        signatures: of the template's vertices and of the scan's points, metres.
         landmarks: template vertices, and their places on the scan, metres.
     """
     graph = analysis.graph
@@ -50,19 +56,24 @@ def approach(
     constant = start - rows.apply(nodes)
     chosen = spread_evenly(start, config.vertices)
     voters = spread_evenly(surface.points, config.voters)
-    votes = _Votes(surface.points[voters].astype(np.float32), surface.normals[voters].astype(np.float32), config)
+    unlike = None if signatures is None else _unlike(signatures[0][chosen], signatures[1][voters], config)
+    votes = _Votes(
+        surface.points[voters].astype(np.float32), surface.normals[voters].astype(np.float32), unlike, config
+    )
     data_rows = rows_of_vertices(graph, start, chosen)
     mark_rows = rows_of_vertices(graph, start, landmarks[0] if landmarks else np.zeros(0, np.int64))
     node_rows, node_constant = smooth_rows(graph, start)
     pair_rows, pairs = node_edge_rows(graph)
     pair_start = edge_vectors(start[graph.nodes], pairs)
     lengths = np.linalg.norm(edge_vectors(analysis.rest[graph.nodes], pairs), axis=1)
-    width = (first_width or config.width[0], config.width[1])
+    first = config.width[0] if signatures is None else config.signature_width
+    width = (first_width or first, config.width[1])
     vertices = start
     for step in range(config.steps):
         at = (step, config.steps)
         normals = mesh_normals(vertices, analysis.faces)[chosen]
-        terms = [votes.term(data_rows, vertices[chosen], normals, anneal(width, *at))]
+        told = anneal(config.signature_weight, *at)
+        terms = [votes.term(data_rows, vertices[chosen], normals, anneal(width, *at), told)]
         if landmarks is not None:
             weight = config.landmarks / len(landmarks[0])
             metric = np.tile(weight * np.eye(3), (len(landmarks[0]), 1, 1))
@@ -87,24 +98,39 @@ class _Votes:
 
     points: np.ndarray
     normals: np.ndarray
+    unlike: np.ndarray | None
+    """(template points, scan points) half the squared distances of their signatures, in standard deviations."""
     config: ApproachConfig
 
-    def term(self, rows: Rows, points: np.ndarray, normals: np.ndarray, width: float) -> RowTerm:
+    def term(self, rows: Rows, points: np.ndarray, normals: np.ndarray, width: float, told: float) -> RowTerm:
         """Pull each template point to the mean of its votes, as strongly as it has votes.
 
         Args:
             width: of the Gaussian, metres.
+            told: weight of the signatures beside 1 of the distance.
         """
         here = points.astype(np.float32)
         squares = (here**2).sum(axis=1)[:, None] + (self.points**2).sum(axis=1) - 2.0 * (here @ self.points.T)
         facing = normals.astype(np.float32) @ self.normals.T
-        share = np.exp(np.float32(self.config.normal) * (facing - 1.0) - np.maximum(squares, 0.0) / (2.0 * width**2))
-        share /= share.sum(axis=0) + np.float32(np.exp(-(self.config.reach**2) / 2.0))
+        exponent = np.float32(self.config.normal) * (facing - 1.0) - np.maximum(squares, 0.0) / (2.0 * width**2)
+        reach = self.config.reach
+        if self.unlike is not None:
+            exponent -= np.float32(told) * self.unlike
+            reach = self.config.signature_reach
+        share = np.exp(exponent)
+        share /= share.sum(axis=0) + np.float32(np.exp(-(reach**2) / 2.0))
         received = share.sum(axis=1).astype(np.float64)
         target = (share @ self.points) / np.maximum(received, 1e-9)[:, None]
         residual = np.where(received[:, None] > 1e-6, points - target, 0.0)
         weights = np.minimum(received * len(points) / len(self.points), MOST_VOTES) / len(points)
         return RowTerm(rows, weights[:, None, None] * np.eye(3), residual)
+
+
+def _unlike(own: np.ndarray, other: np.ndarray, config: ApproachConfig) -> np.ndarray:
+    """Half the mean squared difference of signatures, template by scan, in standard deviations."""
+    a, b = own.astype(np.float32), other.astype(np.float32)
+    squares = (a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1) - 2.0 * (a @ b.T)
+    return np.maximum(squares, 0.0) / np.float32(2.0 * a.shape[1] * config.signature**2)
 
 
 MOST_VOTES = 4.0

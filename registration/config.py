@@ -336,6 +336,22 @@ class ApproachConfig:
     """How much less a vertex counts whose normal turns away: exp(-normal (1 - cosine))."""
     reach: Positive = 3.5
     """A scan point farther from all vertices than so many standard deviations has hardly a vote."""
+    signature: Positive = 0.03
+    """Standard deviation of geodesic signatures between scan and template, metres."""
+    signature_weight: tuple[NonNegative, NonNegative] = (1.0, 0.02)
+    """Weight of the signatures in the votes, beside 1 of the distance, first and last step."""
+    signature_width: Positive = 0.15
+    """First width of the Gaussian where signatures tell which vertices a scan point may vote for: a limb may swing by
+    several of these."""
+    signature_reach: Positive = 8.0
+    """`reach` where they do."""
+    signature_gap: NonNegative = 0.012
+    """Mean difference, metres, between how signatures are distributed over the scan and over the template, above which
+    they are not compared: the scan shows another part, or joins what the template does not. Up to 0.008 for the same
+    person (11 pairs), 0.014 to 0.042 for a part of one."""
+    signature_size: tuple[Positive, Positive] = (0.89, 1.1)
+    """Distances along the scan over those along the template within which they are compared. Of the same person they
+    were 0.91 to 1.07, of others 0.85, 0.87, 1.04 and 1.13."""
     rigid: tuple[NonNegative, NonNegative] = (5.0, 1.0)
     """Weight of E_rigid, first and last step."""
     smooth: tuple[NonNegative, NonNegative] = (0.5, 0.1)

@@ -9,6 +9,7 @@ Where `align` may, and a rigid motion brings the template far nearer, both are t
 alone if nothing of the scan lies near the start. Then:
 
     wide       the same with wider votes, where limbs had to swing
+    sized      all of these with the template made larger or smaller as a whole, where distances along the scan say so
     soft       growing and shrinking, for what is another of its kind
 
 Each attempt is judged by what of the scan it leaves unreached, and what of itself away from the scan; the best counts.
@@ -18,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -29,6 +31,7 @@ from registration.alignment import align, fit_similarity
 from registration.approach import approach, spread_evenly
 from registration.config import MeshRegistrationConfig, RegistrationConfig, ScanFitConfig
 from registration.correspondences import mesh_normals
+from registration.geodesic_signature import Likeness, geodesic_signatures, likeness
 from registration.quality import FrameQuality, assess, scan_distances
 from registration.register import FrameScan, prepare_frame, register_frame
 from registration.template import TemplateAnalysis, analyse_template
@@ -37,6 +40,7 @@ __all__ = ["Landmarks", "MeshFit", "fit_mesh", "judge"]
 
 Landmarks = tuple[Int64[np.ndarray, " marks"], Float64[np.ndarray, "marks 3"]]
 """Template vertices, and their places on the scan."""
+Signatures = tuple[Float64[np.ndarray, "verts quantiles"], Float64[np.ndarray, "points quantiles"]]
 
 NORMAL_LENGTH = 0.03
 """What a normal turned by 60 degrees counts as among distances, metres, when attempts are compared."""
@@ -51,8 +55,16 @@ LIES_THERE = 0.02
 """Sum of the mean distances either way, metres, below which a template lies on the scan already."""
 SWUNG = 0.85
 """Limbs had to swing where the way from afar brings the misfit down to this share of the near one's."""
+SAME_SIZE = 0.98
+"""Distances along a scan over those along the template of the same person: the median of 11 pairs (0.91 to 1.07)."""
+OTHER_GAP = 0.03
+"""Mean difference of signatures, metres, up to which the scan may show another of the template's kind."""
+MOST_LOST = 0.2
+"""Share of the template that may be far from a scan of another size; of half a person it is half."""
 BORDER_MM = 5.0
 """Mean distance of the template's open borders from the scan above which it does not end where the scan does."""
+FREE = ("sized", "soft")
+"""Ways that keep no lengths."""
 LEAST_MARKS = 3
 """Landmarks that fix a rigid motion."""
 
@@ -67,7 +79,7 @@ class MeshFit:
     analysis: TemplateAnalysis
     scan: FrameScan
     way: str
-    """near, far, wide, or soft."""
+    """near, far, wide, sized, or soft."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,6 +98,31 @@ class _Attempts:
         self.scan = prepare_frame(self.kept, scan, config.registration)
         self.made: list[_Attempt] = []
         self.fault: InputError | None = None
+
+    @cached_property
+    def _compared(self) -> tuple[np.ndarray, Likeness]:
+        """Signatures of the template's vertices, and what those of the scan's points are beside them."""
+        surface, mesh = self.scan.surface, self.garment_scan.mesh
+        own = geodesic_signatures(self.kept.rest, self.kept.faces)
+        other = surface.of_points(geodesic_signatures(mesh.vertices, mesh.faces))
+        return own, likeness(own, self.kept.rest, other, surface.points)
+
+    @property
+    def signatures(self) -> Signatures | None:
+        """Of the template's vertices and of the scan's points; None where the two surfaces are not alike."""
+        own, found = self._compared
+        limits = self.config.approach
+        alike = found.gap <= limits.signature_gap and limits.signature_size[0] <= found.size <= limits.signature_size[1]
+        return (own, found.levelled) if alike else None
+
+    @property
+    def other_size(self) -> float | None:
+        """How much larger the scan is along its surface, where it seems to show another of the template's kind."""
+        found, limits = self._compared[1], self.config.approach
+        low, high = limits.signature_size
+        if low <= found.size <= high or found.gap > OTHER_GAP or not 0.7 < found.size < 1.4:
+            return None
+        return found.size / SAME_SIZE
 
     def add(self, way: str, start: np.ndarray, make: Callable[[], np.ndarray], scan: FrameScan | None = None) -> bool:
         """Make one more; whether it reaches the scan. What lies too far off for it is kept as the pair's fault.
@@ -107,8 +144,17 @@ class _Attempts:
 
     @property
     def reached(self) -> bool:
-        """Whether the last attempt reached the scan."""
-        return bool(self.made) and self.made[-1].reached
+        """Whether an attempt has reached the scan."""
+        return any(attempt.reached for attempt in self.made)
+
+    @property
+    def of_doubtful_size(self) -> bool:
+        """Whether most of the template is on the scan, which is not reached, or from afar alone: limbs of another
+        person's size can be folded up to lie on it. Half a person is no smaller one."""
+        if not self.made or (self.reached and self.best.fit.way == "near"):
+            return False
+        away = 1e3 * self.scan.surface.grid.query(self.best.fit.vertices)[0]
+        return float((away > self.config.scan_fit.far_fail_mm).mean()) <= MOST_LOST
 
     @property
     def swung(self) -> bool:
@@ -144,16 +190,20 @@ def fit_mesh(
     elif config.align == "auto" and landmarks is not None and len(landmarks[0]) >= LEAST_MARKS:
         start = fit_similarity(start[landmarks[0]], landmarks[1], with_scale=False).apply(start)
     start = _keeping_lengths(tried, start, landmarks)
+    if config.lengths == "auto" and landmarks is None and tried.of_doubtful_size:
+        _resized(tried, start)
     if config.lengths == "free" or not (tried.reached or config.lengths == "kept"):
         _freeing_lengths(tried, start)
     if not tried.made:
         assert tried.fault is not None, "an attempt is made or has a fault"
         raise tried.fault
-    kept = [attempt for attempt in tried.made if attempt.fit.way != "soft"]
+    kept = [attempt for attempt in tried.made if attempt.fit.way not in FREE]
     if not kept:
         return tried.best.fit
     closest = min(kept, key=lambda attempt: attempt.misfit)
-    return tried.best.fit if tried.best.misfit < BETTER * closest.misfit else closest.fit
+    better = {"sized": closest.misfit, "soft": BETTER * closest.misfit}  # that the size is another is known already
+    freer = [attempt for attempt in tried.made if attempt.fit.way in FREE and attempt.misfit < better[attempt.fit.way]]
+    return min(freer or [closest], key=lambda attempt: attempt.misfit).fit
 
 
 def _keeping_lengths(tried: _Attempts, start: np.ndarray, landmarks: Landmarks | None) -> np.ndarray:
@@ -164,13 +214,15 @@ def _keeping_lengths(tried: _Attempts, start: np.ndarray, landmarks: Landmarks |
     def near(begin: np.ndarray) -> bool:
         return tried.add("near", begin, lambda: register_frame(analysis, scan, begin, config=own).vertices)
 
-    def drawn(begin: np.ndarray, width: float) -> np.ndarray:
-        there = approach(analysis, scan.surface, begin, config.approach, first_width=width, landmarks=landmarks)
+    def drawn(begin: np.ndarray, width: float | None, told: Signatures | None) -> np.ndarray:
+        there = approach(
+            analysis, scan.surface, begin, config.approach, first_width=width, signatures=told, landmarks=landmarks
+        )
         settled = register_frame(analysis, scan, there, config=_dense_alone(config.stiff)).vertices
         return register_frame(analysis, scan, settled, config=_dense_alone(own)).vertices
 
     def far(begin: np.ndarray) -> bool:
-        return tried.add("far", begin, lambda: drawn(begin, config.approach.width[0]))
+        return tried.add("far", begin, lambda: drawn(begin, None, tried.signatures))
 
     movable = config.align == "auto" and landmarks is None
     if config.lengths == "free":
@@ -189,9 +241,25 @@ def _keeping_lengths(tried: _Attempts, start: np.ndarray, landmarks: Landmarks |
         return moved
     if tried.swung:
         start = tried.best.fit.start
-        tried.add("wide", start, lambda: drawn(start, config.approach.wider))
+        tried.add("wide", start, lambda: drawn(start, config.approach.wider, None))
         return start
     return moved
+
+
+def _resized(tried: _Attempts, start: np.ndarray) -> None:
+    """The template made as large as the scan as a whole, and brought there with the lengths it has then."""
+    factor = tried.other_size
+    if factor is None:
+        return
+    rest, middle = tried.kept.rest, start.mean(axis=0)
+    template = tried.garment.template.with_vertices((factor * rest).astype(np.float32))
+    own = _Attempts(replace(tried.garment, template=template), tried.garment_scan, tried.config)
+    begin = _moved_there(middle + factor * (start - middle), own.scan)
+    _keeping_lengths(own, begin, None)
+    if own.made:
+        best = own.best
+        fit = MeshFit(best.fit.vertices, best.fit.start, tried.kept, tried.scan, "sized")
+        tried.made.append(_Attempt(fit, best.misfit, best.reached))
 
 
 def _freeing_lengths(tried: _Attempts, start: np.ndarray) -> None:

@@ -30,6 +30,7 @@ from capture4d.mesh_files.meshes import WRITABLE, read_coloured_mesh, read_mesh,
 from capture4d.types import Garment, GarmentScan, Mesh
 from capture4d.units import METRES, Units
 from registration.config import MeshRegistrationConfig
+from registration.floor import find_floor
 from registration.landmarks import Landmarks, read_landmarks
 from registration.mesh_fit import fit_mesh, judge
 from registration.quality import FrameQuality, assess
@@ -59,6 +60,8 @@ class MeshRegistration:
     """Which attempt counts: near, far, wide, or soft (`registration.mesh_fit`)."""
     estimated: bool = False
     """The scan came as points alone; its faces are made between them."""
+    floor_percent: float = 0.0
+    """Share of the scan's vertices that were left out as a floor or a wall which the template does not have."""
     notes: tuple[str, ...] = ()
     """What in the files could not be used, each with the file's name."""
 
@@ -114,6 +117,7 @@ def run(
         "scan": str(scan_path),
         "units": units,
         "scan_faces": "estimated" if result.estimated else "given",
+        "scan_floor_percent": round(result.floor_percent, 2),
         "way": result.way,
         "verdict": result.quality.verdict,
         "reasons": list(result.quality.reasons),
@@ -124,8 +128,15 @@ def run(
     with new_files(outputs, inputs=inputs, overwrite=overwrite) as workshop:
         write_mesh(workshop / output_path.name, mesh, polygon_sizes=template_file.polygon_sizes)
         write_json(workshop / outputs[1].name, {**measures, "cpu_s": cpu_s})
-    noted = ((template_path, template_file), (scan_path, scan_file))
-    return replace(result, notes=tuple(f"{path}: {note}" for path, found in noted for note in found.notes))
+    noted = ((template_path, template_file.notes), (scan_path, scan_file.notes), (scan_path, _told(result)))
+    return replace(result, notes=tuple(f"{path}: {note}" for path, notes in noted for note in notes))
+
+
+def _told(result: MeshRegistration) -> tuple[str, ...]:
+    """What was left out of the scan."""
+    if result.floor_percent == 0.0:
+        return ()
+    return (f"a floor or wall, {result.floor_percent:.0f} % of the scan, is left out; the template has none",)
 
 
 def _earlier(outputs: Sequence[Path], template: str, scan: str, overwrite: bool) -> Mapping[str, Any]:
@@ -176,9 +187,13 @@ def register_mesh(
         return scale * (points.astype(np.float64) - origin)
 
     start = normalised(template.vertices)
-    garment_scan = _garment_scan(
-        surface.mesh, normalised(surface.mesh.vertices), surface.colours, find_border, config, scan_name
+    shown, colours, floor_percent = _without_floor(
+        replace(surface.mesh, vertices=normalised(surface.mesh.vertices).astype(np.float32)),
+        surface.colours,
+        start,
+        template,
     )
+    garment_scan = _garment_scan(shown, colours, find_border, config, scan_name)
     loops = {f"border_{index}": loop for index, loop in enumerate(boundary_loops(template.faces))}
     if config.border_colour and not loops:
         raise InputError(f"{template_name}: expected open borders, for --border-colour is given; found none")
@@ -206,6 +221,7 @@ def register_mesh(
         quality=_at_vertices(replace(quality, verdict=verdict, reasons=reasons), split.of_vertex),
         way=fitted.way,
         estimated=surface.estimated,
+        floor_percent=floor_percent,
     )
 
 
@@ -241,16 +257,27 @@ def _require_one_unit(template: float, scan: float, template_name: str, scan_nam
         )
 
 
+def _without_floor(
+    scan: Mesh, colours: np.ndarray | None, start: np.ndarray, template: Mesh
+) -> tuple[Mesh, np.ndarray | None, float]:
+    """The scan and its colours without a floor that the template does not have, and its share of the vertices in per
+    cent."""
+    on_floor = find_floor(scan.vertices.astype(np.float64), scan.faces)
+    if on_floor is None or find_floor(start, template.faces) is not None:
+        return scan, colours, 0.0
+    kept_faces = ~on_floor[scan.faces].any(axis=1)
+    shown, kept = submesh(scan, kept_faces)
+    return shown, None if colours is None else colours[kept], 100.0 * float(on_floor.mean())
+
+
 def _garment_scan(
-    scan: Mesh,
-    vertices: np.ndarray,
+    mesh: Mesh,
     colours: np.ndarray | None,
     find_border: FindBorder | None,
     config: MeshRegistrationConfig,
     name: str,
 ) -> GarmentScan:
     """The whole scan, with the border points that its paint shows."""
-    mesh = Mesh(vertices.astype(np.float32), scan.faces)
     if not config.border_colour:
         none = np.zeros((0, 3), np.float32)
         return GarmentScan(submesh(mesh, np.ones(len(mesh.faces), bool))[0], none, np.zeros(0, np.int32), (), 0)

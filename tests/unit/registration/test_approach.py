@@ -49,6 +49,18 @@ def test_a_bent_finger_is_followed(garment, scan_of, config) -> None:
     assert mean_error(found, truth) < 0.4 * mean_error(analysis.rest, truth)
 
 
+def test_signatures_bring_a_finger_round_that_nearness_does_not(garment, scan_of, tube, config) -> None:
+    """Half a turn: the tip comes to lie beside the root. The signature here is the height on the straight finger."""
+    analysis = analyse_template(straight(garment), config)
+    scan = scan_of(lambda points: bent(points, 180.0), around=80, along=60).mesh
+    surface = prepare_scan(scan.vertices, scan.faces, smoothing_passes=0)
+    truth = bent(garment.template.vertices, 180.0)
+    heights = garment.template.vertices[:, 1:2].astype(float), tube(80, 60).vertices[:, 1:2].astype(float)
+    without = approach(analysis, surface, analysis.rest, ApproachConfig())
+    told = approach(analysis, surface, analysis.rest, ApproachConfig(), signatures=heights)
+    assert mean_error(told, truth) < 0.5 * mean_error(without, truth)
+
+
 def test_what_is_not_scanned_follows_its_neighbours(garment, scan_of, config) -> None:
     analysis = analyse_template(garment, config)
     scan = scan_of(lambda points: points + np.array([0.05, 0.02, 0.0])).mesh
