@@ -20,13 +20,13 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from capture4d.body.binding import bind
 from capture4d.body.skinning import PosedBody, ShapedBody, skin, unskin, with_pose
-from capture4d.geometry.mesh import unique_edges, vertex_normals
+from capture4d.geometry.mesh import unique_edges, vertex_adjacency, vertex_normals
 from capture4d.geometry.ray_casting import TriangleScene
 from capture4d.heavy_imports import import_warp
 from capture4d.types import PoseSequence
 from data_synth.cloth.panels import Pattern
 from data_synth.cloth.patterns import PanelMesh, smooth_noise
-from data_synth.cloth.tailoring import Made, Sleeve, Wall, bending_factors, wall_depth, walls
+from data_synth.cloth.tailoring import Made, Sleeve, Wall, bending_factors, wall_heights, walls
 from data_synth.config import Fabric, SimulationConfig
 
 __all__ = ["approach_poses", "dress", "dressing_rotations", "simulate"]
@@ -38,6 +38,8 @@ LIFT_M = 0.035
 """The panels start this far above their place, clear of the shoulders."""
 WALL_MARGIN_M = 0.005
 """Room that sleeve and trunk keep to the plane between them, for the folds of both."""
+WALL_OPENING = 0.125
+"""How fast that room grows from the underarm downwards."""
 PILLOW_M = 0.13
 """Distance from the seams over which front and back part."""
 
@@ -221,7 +223,8 @@ def simulate(
         previous, current = current, bodies[frame].vertices()
         if frame == config.calm_frames and config.hold_hz > 0:
             cloth = state.particle_q.numpy().astype(np.float64)
-            hold = _Hold.take(mesh, cloth, bodies[frame - 1], model.particle_mass.numpy(), config)
+            spread = 0 if made is None else made.folds.hold_spread
+            hold = _Hold.take(mesh, cloth, bodies[frame - 1], model.particle_mass.numpy(), config, spread)
         held = None if hold is None else (hold.places(bodies[frame - 1]), hold.places(bodies[frame]))
         calm = frame <= config.calm_frames
         between = _Walls.of(made, bodies[frame], model.particle_mass.numpy())
@@ -268,10 +271,23 @@ class _Hold:
 
     @staticmethod
     def take(
-        mesh: PanelMesh, cloth: np.ndarray, body: PosedBody, masses: np.ndarray, config: SimulationConfig
+        mesh: PanelMesh,
+        cloth: np.ndarray,
+        body: PosedBody,
+        masses: np.ndarray,
+        config: SimulationConfig,
+        spread: int,
     ) -> _Hold:
-        """Hold the cloth, (V, 3) with limbs well apart, where it is on the body now; firmest at the shoulders."""
+        """Hold the cloth, (V, 3) with limbs well apart, where it is on the body now; firmest at the shoulders.
+
+        Args:
+            spread: passes that smooth the skin weights over the cloth.
+        """
         _, _, weights = bind(cloth, mesh.faces, body)
+        adjacency = vertex_adjacency(mesh.faces, mesh.vertex_count).astype(np.float64)
+        around = np.asarray(adjacency.sum(axis=1)).reshape(-1, 1)
+        for _ in range(spread):
+            weights = 0.5 * weights + 0.5 * (adjacency @ weights) / around
         rest, flagged = unskin(cloth, weights, body.transforms)
         assert not flagged.any(), "the dressing pose cannot be unposed"
         bumps = smooth_noise(mesh.noise_uv, config.hold_ripple_m, config.hold_ripple_width_m, np.random.default_rng(1))
@@ -308,8 +324,9 @@ class _Walls:
     def push(self, points: np.ndarray, forces: np.ndarray) -> None:
         """Add to forces, (V, 3) N, what drives cloth at some points, (V, 3), back to its side."""
         for sleeve, wall in zip(self.sleeves, self.planes, strict=True):
-            depth = wall_depth(points, sleeve, wall, WALL_MARGIN_M)
-            deep = depth > 0
+            heights, below = wall_heights(points, sleeve, wall)
+            depth = np.minimum(WALL_MARGIN_M, WALL_OPENING * below) - heights
+            deep = (below > 0) & (depth > 0)
             rows, away = sleeve.rows[deep], (sleeve.signs * depth)[deep]
             forces[rows] += (self.stiffness[rows] * away)[:, None] * wall.normal
 

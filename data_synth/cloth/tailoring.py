@@ -18,18 +18,16 @@ from data_synth.cloth.panels import Pattern
 from data_synth.cloth.patterns import PanelMesh, smooth_noise
 from data_synth.config import Fabric, FoldConfig
 
-__all__ = ["Made", "Sleeve", "Tailoring", "Wall", "bending_factors", "shrunk", "tailor", "wall_depth", "walls"]
+__all__ = ["Made", "Sleeve", "Tailoring", "Wall", "bending_factors", "shrunk", "tailor", "wall_heights", "walls"]
 
 PATCH_SEED = 5
 """Of the patches: one garment has them in one place on every mesh."""
-PATCH_RANGE = (0.25, 3.0)
+PATCH_RANGE = (0.1, 3.5)
 """Least and most excess of a patch over the mean."""
 CALM_FROM_M, CALM_TO_M = 0.16, 0.02
 """Below the underarm, between these, the calm zone of a shirt's front and back begins."""
 CALM_ASIDE = (0.55, 0.95)
 """Shares of the half width between which it ends towards the sides."""
-MARGIN_REACH_M = 0.04
-"""From the underarm to where cloth keeps its full distance to the wall."""
 SLEEVE_SIDE = 0.3
 """Share of the half width beyond which front and back can meet the sleeve."""
 
@@ -123,16 +121,11 @@ def walls(sleeves: tuple[Sleeve, ...], body: PosedBody) -> tuple[Wall, ...]:
     return tuple(found)
 
 
-def wall_depth(points: np.ndarray, sleeve: Sleeve, wall: Wall, margin: float) -> np.ndarray:
-    """How far the sleeve's `rows` of some points, (V, 3), are on the wrong side of the wall or too near to it, (n,).
-
-    Args:
-        margin: the room they have to keep; it grows from nothing at the underarm.
-    """
+def wall_heights(points: np.ndarray, sleeve: Sleeve, wall: Wall) -> tuple[np.ndarray, np.ndarray]:
+    """How far the sleeve's `rows` of some points, (V, 3), are on their own side of the wall, and how far below the
+    underarm, both (n,) metres; above the underarm there is no wall."""
     from_underarm = points[sleeve.rows] - points[sleeve.underarm]
-    below = from_underarm @ wall.along
-    room = margin * np.clip(below / MARGIN_REACH_M, 0, 1)
-    return np.where(below > 0, room - sleeve.signs * (from_underarm @ wall.normal), 0.0)
+    return sleeve.signs * (from_underarm @ wall.normal), from_underarm @ wall.along
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:

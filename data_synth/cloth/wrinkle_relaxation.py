@@ -25,7 +25,7 @@ from capture4d.geometry.mesh import vertex_adjacency, vertex_normals
 from capture4d.geometry.ray_casting import TriangleScene, barycentric
 from data_synth.cloth.patterns import PanelMesh, locate, smooth_noise
 from data_synth.cloth.stencils import hinges, rest_lengths
-from data_synth.cloth.tailoring import Made, Sleeve, Wall, bending_factors, shrunk, wall_depth, walls
+from data_synth.cloth.tailoring import Made, Sleeve, Wall, bending_factors, shrunk, wall_heights, walls
 from data_synth.cloth.tightening import tighten
 from data_synth.config import Fabric, RelaxationConfig
 
@@ -41,7 +41,7 @@ __all__ = [
     "wrinkle_mesh",
 ]
 
-FOLD_ROOM_M = 0.006
+FOLD_ROOM_M = 0.015
 """Cloth as near to the plane between arm and trunk stays on its side of it."""
 
 
@@ -71,6 +71,8 @@ class WrinkleMesh:
     """(V,) float32 offset along the normal from which folds start, metres."""
     sleeves: tuple[Sleeve, ...] = ()
     """What must not pass through each other."""
+    raised: np.ndarray | None = None
+    """(V,) how far a turned layer stands out, metres."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,6 +142,7 @@ def wrinkle_mesh(
         hinge_weights=weights.astype(np.float32),
         imperfection=smooth_noise(fine.noise_uv, config.imperfection_m, config.imperfection_width_m, rng),
         sleeves=() if made is None else made.tailoring.sleeves,
+        raised=None if made is None else np.where(made.tailoring.strip, made.folds.strip_thickness_m, 0.0),
     )
 
 
@@ -205,6 +208,10 @@ def relax_levels(
     for number, level in enumerate(levels):
         sheet, offset = relax_frame(level, sheet, surface, None if previous is None else previous[number], between)
         offsets.append(offset)
+    raised = levels[-1].mesh.raised
+    if raised is not None:
+        outwards = vertex_normals(sheet.astype(np.float64), levels[-1].mesh.faces)
+        sheet = (sheet + raised[:, None] * outwards).astype(np.float32)
     return sheet, offsets
 
 
@@ -295,13 +302,15 @@ def _stand_walls(
     plane_points: np.ndarray,
     plane_normals: np.ndarray,
 ) -> None:
-    """Write the wall beside a sleeve over the half plane, (V, 3) each, of every vertex that is beyond it."""
+    """Write the wall beside a sleeve over the half plane, (V, 3) each, of every vertex that is nearer to the wall."""
     for sleeve, wall in zip(sleeves, between, strict=True):
-        depth = wall_depth(points, sleeve, wall, FOLD_ROOM_M)
-        beyond = depth > 0
-        rows, signs = sleeve.rows[beyond], sleeve.signs[beyond]
-        plane_normals[rows] = (signs[:, None] * wall.normal).astype(np.float32)
-        plane_points[rows] = points[rows] + ((depth[beyond] - FOLD_ROOM_M) * signs)[:, None] * wall.normal
+        heights, below = wall_heights(points, sleeve, wall)
+        over_body = np.einsum(
+            "nc,nc->n", points[sleeve.rows] - plane_points[sleeve.rows], plane_normals[sleeve.rows]
+        )
+        near = (below > 0) & (heights < np.minimum(over_body, FOLD_ROOM_M))
+        rows, normals = sleeve.rows[near], sleeve.signs[near, None] * wall.normal
+        plane_normals[rows], plane_points[rows] = normals, points[rows] - heights[near, None] * normals
 
 
 def _material_frames(mesh: WrinkleMesh, base: np.ndarray, normals: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ import pytest
 from capture4d.body.skinning import ShapedBody, with_pose
 from data_synth.cloth.panels import Pattern
 from data_synth.cloth.patterns import PanelMesh, locate, mesh_pattern
-from data_synth.cloth.tailoring import Made, bending_factors, shrunk, tailor, wall_depth, walls
+from data_synth.cloth.tailoring import Made, bending_factors, shrunk, tailor, wall_heights, walls
 from data_synth.cloth.tshirt import tshirt_pattern
 from data_synth.config import Fabric, FoldConfig, GarmentStyle
 
@@ -86,6 +86,7 @@ def test_a_wall_parts_arm_and_trunk(person: ShapedBody, shirt, raised_deg: float
     on_arm, on_side = elbow, points[left.underarm] - [0, 0.25, 0]
     for place, wrong in ((on_arm, left.signs < 0), (on_side, left.signs > 0)):
         points[left.rows[left.rows != left.underarm]] = place
-        beyond = wall_depth(points, left, wall, margin=0.0) > 0
+        heights, below = wall_heights(points, left, wall)
         here = left.rows != left.underarm
-        np.testing.assert_array_equal(beyond[here], wrong[here])
+        assert below[here].min() > 0
+        np.testing.assert_array_equal(heights[here] < 0, wrong[here])
