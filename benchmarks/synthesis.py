@@ -14,6 +14,7 @@ import tempfile
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from rich.console import Console
@@ -29,13 +30,14 @@ from data_synth.cloth.patterns import locate
 from data_synth.cloth.quality import measure_cloth, principal_stretches
 from data_synth.cloth.simulation import dress, simulate
 from data_synth.cloth.wrinkle_relaxation import lift_levels, relax_levels
-from data_synth.config import FABRICS, FOLDED, PRESETS, MotionConfig, SynthConfig
+from data_synth.config import FABRICS, OTHER_BODIES, PRESETS, MotionConfig, SynthConfig, folded
 from data_synth.scanner.scan import LABEL_BODY, scan_surfaces
 from data_synth.stage import run as synthesise
 from data_synth.take import TakePlan, plan_take, simulate_take, take_rig, take_surfaces
 
 POSES = ("rest", "hanging", "half", "overhead")
-FOLD_KEYS = ("fold_p90_to_median", "calm_percent", "fold_height_rms_mm", "compression_p1")
+FOLD_UNITS = {"fold_p90_to_median": "", "calm_percent": "%", "fold_height_rms_mm": "mm", "compression_p1": ""}
+"""Means over the poses, and each of them; compression is the first percentile of the least stretch of any face."""
 OVERHEAD_COSINE = 0.5
 """An upper arm that points up steeper than this is overhead."""
 
@@ -48,29 +50,19 @@ class _Job:
     late_start: int | None
 
 
-def run(*, quick: bool = False, frames: int = 120, workers: int = 2) -> list[Metric]:
-    """Simulate and scan takes of two fabrics with two seeds.
+def run(
+    *, quick: bool = False, frames: int = 120, every: int = 1, data: Literal["even", "folds"] = "even", workers: int = 2
+) -> list[Metric]:
+    """Simulate and scan takes of two fabrics with two seeds, or on two bodies in two motions.
 
     Args:
         quick: one small take of 16 frames, the same keys.
         frames: frames of each take.
+        every: simulated frames to a captured one.
+        data: cloth with its excess everywhere alike, or with folds here and there.
     """
-    if quick:
-        small = replace(PRESETS["tiny"], frames=16, capture_every=2)
-        jobs = [_Job(small, scan_every=8, converge_frames=10, late_start=6)]
-    else:
-        base = replace(PRESETS["tshirt-200k"], frames=frames)
-        jobs = [
-            _Job(
-                replace(base, fabric=fabric, seed=seed),
-                scan_every=max(1, frames // 8),
-                converge_frames=40 if seed == 0 else 0,
-                late_start=frames // 3 if seed == 0 else None,
-            )
-            for fabric in ("jersey", "shirt-cotton")
-            for seed in (0, 1)
-        ]
     rows = []
+    jobs = _jobs(frames, every, data, quick=quick)
     for config, row in run_jobs(_measure, jobs, workers=workers, label="Synthetic takes"):
         numbers = ", ".join(f"{key} {value:.4g}" for key, value in row.items())
         Console(stderr=True).print(f"{config.fabric}, seed {config.seed}: {numbers}", soft_wrap=True)
@@ -115,6 +107,38 @@ def run(*, quick: bool = False, frames: int = 120, workers: int = 2) -> list[Met
         Metric("hole_percent_least", least("hole_percent_least"), "%", "higher"),
         Metric("hole_percent_most", worst("hole_percent_most"), "%"),
         Metric("same_seed_same_digest", float(len(digests) == 1), "", "higher"),
+        *(
+            Metric(name, mean(name), FOLD_UNITS[key], "lower" if key == "calm_percent" else "higher")
+            for key in FOLD_UNITS
+            for name in (key, *(f"{key}_{pose}" for pose in POSES))
+        ),
+    ]
+
+
+def _jobs(frames: int, every: int, data: Literal["even", "folds"], *, quick: bool) -> list[_Job]:
+    if quick:
+        small = replace(PRESETS["tiny"], frames=16, capture_every=2)
+        small = small if data == "even" else folded(small)
+        return [_Job(small, scan_every=8, converge_frames=10, late_start=6)]
+    base = replace(PRESETS["tshirt-200k"], frames=frames, capture_every=every)
+    if data == "folds":
+        takes = [
+            replace(folded(base), fabric="jersey"),
+            replace(folded(base), fabric="shirt-cotton", seed=1, body_shape=OTHER_BODIES["heavy"]),
+            replace(folded(base), fabric="shirt-cotton", seed=2, motion=MotionConfig("arm-circles")),
+        ]
+    else:
+        takes = [
+            replace(base, fabric=fabric, seed=seed) for fabric in ("jersey", "shirt-cotton") for seed in (0, 1)
+        ]
+    return [
+        _Job(
+            take,
+            scan_every=max(1, frames // 8),
+            converge_frames=40 if take.seed == 0 else 0,
+            late_start=frames // 3 if take.seed == 0 else None,
+        )
+        for take in takes
     ]
 
 
@@ -211,7 +235,7 @@ def _folds(take: TakePlan, clip: list) -> dict[str, float]:
         row[f"calm_percent_{pose}"] = folds.calm_percent
         row[f"fold_height_rms_mm_{pose}"] = folds.height_rms_mm
         row[f"compression_p1_{pose}"] = float(np.percentile(principal_stretches(take.fine, fine)[:, 0], 1))
-    for key in FOLD_KEYS:
+    for key in FOLD_UNITS:
         row[key] = float(np.mean([row[f"{key}_{pose}"] for pose in POSES]))
     return row
 

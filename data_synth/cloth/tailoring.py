@@ -22,12 +22,14 @@ __all__ = ["Made", "Sleeve", "Tailoring", "Wall", "bending_factors", "shrunk", "
 
 PATCH_SEED = 5
 """Of the patches: one garment has them in one place on every mesh."""
-PATCH_RANGE = (0.1, 3.5)
+PATCH_RANGE = (0.05, 4.0)
 """Least and most excess of a patch over the mean."""
 CALM_FROM_M, CALM_TO_M = 0.16, 0.02
 """Below the underarm, between these, the calm zone of a shirt's front and back begins."""
 CALM_ASIDE = (0.55, 0.95)
 """Shares of the half width between which it ends towards the sides."""
+YOKE_M = (0.0, 0.06)
+"""Above the underarm, between these, it widens to the armholes, and begins on the sleeves' caps."""
 SLEEVE_SIDE = 0.3
 """Share of the half width beyond which front and back can meet the sleeve."""
 
@@ -142,13 +144,18 @@ def _draft(mesh: PanelMesh, pattern: Pattern, uv: np.ndarray, panels: np.ndarray
 
 
 def _calm(mesh: PanelMesh, pattern: Pattern) -> np.ndarray:
-    """(F,) 1 where a shirt lies calm on chest and shoulder blades, 0 elsewhere and on other garments."""
+    """(F,) 1 where a shirt lies calm, on chest, shoulder blades, yoke and sleeve caps; 0 elsewhere and on other garments."""
     names = [panel.name for panel in pattern.panels]
     if not {"front", "back", "sleeve_left"} <= set(names):
         return np.zeros(len(mesh.faces))
-    u, v = _draft(mesh, pattern, mesh.uv.mean(axis=1), mesh.face_panels)
-    trunk = np.isin(np.array(names)[mesh.face_panels], ("front", "back"))
-    return np.where(trunk, _smooth_step(v, -CALM_FROM_M, -CALM_TO_M) * (1 - _smooth_step(np.abs(u), *CALM_ASIDE)), 0.0)
+    middle, panels = mesh.uv.mean(axis=1), np.array(names)[mesh.face_panels]
+    u, v = _draft(mesh, pattern, middle, mesh.face_panels)
+    over_underarm = _smooth_step(v, *YOKE_M)
+    aside = (1 - over_underarm) * _smooth_step(np.abs(u), *CALM_ASIDE)
+    on_trunk = _smooth_step(v, -CALM_FROM_M, -CALM_TO_M) * (1 - aside)
+    origins = np.array([panel.origin[1] for panel in pattern.panels])
+    on_sleeve = _smooth_step(middle[:, 1] - origins[mesh.face_panels], *YOKE_M)
+    return np.where(np.isin(panels, ("front", "back")), on_trunk, on_sleeve)
 
 
 def _smooth_step(x: np.ndarray, low: float, high: float) -> np.ndarray:
