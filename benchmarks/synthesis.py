@@ -128,9 +128,7 @@ def _jobs(frames: int, every: int, data: Literal["even", "folds"], *, quick: boo
             replace(folded(base), fabric="shirt-cotton", seed=2, motion=MotionConfig("arm-circles")),
         ]
     else:
-        takes = [
-            replace(base, fabric=fabric, seed=seed) for fabric in ("jersey", "shirt-cotton") for seed in (0, 1)
-        ]
+        takes = [replace(base, fabric=fabric, seed=seed) for fabric in ("jersey", "shirt-cotton") for seed in (0, 1)]
     return [
         _Job(
             take,

@@ -253,9 +253,7 @@ class SynthConfig:
 def folded(config: SynthConfig) -> SynthConfig:
     """The same take in a garment that folds here and there: its sheet is coarser, for there are two meshes over it, and
     hangs more freely below the chest."""
-    simulation = replace(
-        config.simulation, vertices=2500, substeps=32, damping=0.993, hold_hz=17.0, hold_floor=0.035
-    )
+    simulation = replace(config.simulation, vertices=2500, substeps=32, damping=0.993, hold_hz=17.0, hold_floor=0.035)
     return replace(config, folds=FoldConfig(), simulation=simulation)
 
 

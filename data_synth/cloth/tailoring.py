@@ -1,7 +1,7 @@
 """Where a garment has more cloth than it needs, and how it was sewn: fields over its pattern, for any mesh of it.
 
-A worn shirt lies calm over chest and shoulder blades and has too much cloth elsewhere, here more, there less. The excess
-is a share of the cloth's size, across and along the grain: a calm zone of shirts, and patches of log-normal noise.
+A worn shirt lies calm over chest and shoulder blades and has too much cloth elsewhere, here more, there less. The
+excess is a share of the cloth's size, across and along the grain: a calm zone of shirts, and patches of log-normal noise.
 
 Letters: V vertices, F faces; u across, v along the grain, metres.
 """
@@ -96,9 +96,9 @@ def shrunk(mesh: PanelMesh, scale: np.ndarray, share: float = 1.0) -> PanelMesh:
 
 
 def bending_factors(mesh: PanelMesh, made: Made, fabric: Fabric, edges: np.ndarray) -> np.ndarray:
-    """How much stiffer the cloth bends about some inner edges, (E, 2), than one layer of it does across its grain, (E,).
+    """How much stiffer cloth bends about some inner edges, (E, 2), than one layer of it does across its grain, (E,).
 
-    Turned layers and seams are stiffer, and cloth that is bent along its grain, about edges across it, by the fabric's ratio.
+    Turned layers and seams are stiffer, and cloth bent along its grain, about edges across it, by the fabric's ratio.
     """
     direction = mesh.vertex_uv[edges[:, 1]] - mesh.vertex_uv[edges[:, 0]]
     across = direction[:, 0] ** 2 / np.maximum((direction**2).sum(axis=1), 1e-18)
@@ -144,7 +144,7 @@ def _draft(mesh: PanelMesh, pattern: Pattern, uv: np.ndarray, panels: np.ndarray
 
 
 def _calm(mesh: PanelMesh, pattern: Pattern) -> np.ndarray:
-    """(F,) 1 where a shirt lies calm, on chest, shoulder blades, yoke and sleeve caps; 0 elsewhere and on other garments."""
+    """(F,) 1 where a shirt lies calm: chest, shoulder blades, yoke, sleeve caps; 0 elsewhere and on other garments."""
     names = [panel.name for panel in pattern.panels]
     if not {"front", "back", "sleeve_left"} <= set(names):
         return np.zeros(len(mesh.faces))

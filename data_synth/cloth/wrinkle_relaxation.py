@@ -305,9 +305,7 @@ def _stand_walls(
     """Write the wall beside a sleeve over the half plane, (V, 3) each, of every vertex that is nearer to the wall."""
     for sleeve, wall in zip(sleeves, between, strict=True):
         heights, below = wall_heights(points, sleeve, wall)
-        over_body = np.einsum(
-            "nc,nc->n", points[sleeve.rows] - plane_points[sleeve.rows], plane_normals[sleeve.rows]
-        )
+        over_body = np.einsum("nc,nc->n", points[sleeve.rows] - plane_points[sleeve.rows], plane_normals[sleeve.rows])
         near = (below > 0) & (heights < np.minimum(over_body, FOLD_ROOM_M))
         rows, normals = sleeve.rows[near], sleeve.signs[near, None] * wall.normal
         plane_normals[rows], plane_points[rows] = normals, points[rows] - heights[near, None] * normals
