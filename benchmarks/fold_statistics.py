@@ -1,10 +1,11 @@
 """How cloth is folded, at the sampling of a template: how deep, and how unevenly.
 
-A surface is smoothed to two scales by one implicit step each of Laplacian smoothing, (M + (s / 2 pi)^2 K) x = M x0 with
-the lumped mass matrix M and the cotangent stiffness K; what lies between 20 and 90 mm is what is lost from one to the
-other. Turn is the angle between the normals of both, height their distance along the smoother one's normal. Real captures
-of clothed people (five pieces of cloth, smoothed by their reconstruction to 18 mm) have a ninth decile of the turn 2.7 to
-3.15 times its median, 20 to 34 % of their area calm, and 2.65 to 3.9 mm of height, root mean square.
+A surface is smoothed to two scales by one implicit step each of Laplacian smoothing, (M + (s / 2 pi)^2 K) x = M x0
+with the lumped mass matrix M and the cotangent stiffness K; what lies between 20 and 90 mm is what is lost from one
+to the other. Turn is the angle between the normals of both, height their distance along the smoother one's normal.
+Real captures of clothed people (five pieces of cloth, smoothed by their reconstruction to 18 mm) have a ninth decile
+of the turn 2.7 to 3.15 times its median, 20 to 34 % of their area calm, and 2.65 to 3.9 mm of height, root mean
+square.
 
 References: implicit fairing, Desbrun et al., Implicit Fairing of Irregular Meshes (SIGGRAPH 1999).
 """
@@ -77,7 +78,7 @@ def torso(vertices: np.ndarray) -> np.ndarray:
 def smoothed(
     vertices: np.ndarray, faces: np.ndarray, scales_m: tuple[float, ...]
 ) -> tuple[list[np.ndarray], np.ndarray]:
-    """A surface, (V, 3), without what is smaller than each of some scales, metres; and the area of each vertex, (V,)."""
+    """A surface, (V, 3), without what is smaller than each of some scales, metres; the area of each vertex, (V,)."""
     rows, columns, weights, areas = [], [], [], np.zeros(len(vertices))
     for corner in range(3):
         a, b, c = faces[:, corner], faces[:, (corner + 1) % 3], faces[:, (corner + 2) % 3]

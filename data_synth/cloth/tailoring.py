@@ -1,7 +1,8 @@
 """Where a garment has more cloth than it needs, and how it was sewn: fields over its pattern, for any mesh of it.
 
 A worn shirt lies calm over chest and shoulder blades and has too much cloth elsewhere, here more, there less. The
-excess is a share of the cloth's size, across and along the grain: a calm zone of shirts, and patches of log-normal noise.
+excess is a share of the cloth's size, across and along the grain: a calm zone of shirts, and patches of log-normal
+noise.
 
 Letters: V vertices, F faces; u across, v along the grain, metres.
 """
