@@ -112,6 +112,8 @@ def bending_factors(mesh: PanelMesh, made: Made, fabric: Fabric, edges: np.ndarr
 
 def walls(sleeves: tuple[Sleeve, ...], body: PosedBody) -> tuple[Wall, ...]:
     """Where each arm of a posed body parts from the trunk: the plane that halves the angle between them."""
+    if not sleeves:
+        return ()
     names, centres = body.shaped.body.joint_names, body.joint_centres()
     found = []
     down = _unit(centres[names.index("root")] - centres[names.index("neck01")])
