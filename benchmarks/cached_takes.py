@@ -31,7 +31,7 @@ def cached_training_set(config: TrainingSetConfig, *, workers: int = 2) -> Path:
 
 def _folder(config: SynthConfig | TrainingSetConfig, schema: int) -> Path:
     known = json.dumps([schema, asdict(config)], sort_keys=True)
-    for later in ("print", "print_mm"):  # takes were made, and are kept, before there were prints
+    for later in ("print", "print_mm", "folds"):  # takes were made, and are kept, before there were these
         known = known.replace(f', "{later}": null', "")
     key = hashlib.sha256(known.encode()).hexdigest()[:12]
     return user_cache_folder() / "takes" / f"{config.name}-{key}"

@@ -14,10 +14,12 @@ import tempfile
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from rich.console import Console
 
+from benchmarks.fold_statistics import fold_statistics, torso
 from benchmarks.metric import Metric
 from benchmarks.scan_errors import scan_errors
 from capture4d.geometry.mesh import vertex_normals
@@ -25,14 +27,17 @@ from capture4d.geometry.triangles import count_intersecting_faces
 from capture4d.runs.workers import run_jobs
 from capture4d.types import Mesh
 from data_synth.cloth.patterns import locate
-from data_synth.cloth.quality import measure_cloth
+from data_synth.cloth.quality import measure_cloth, principal_stretches
 from data_synth.cloth.simulation import dress, simulate
-from data_synth.cloth.wrinkle_relaxation import lift, relax_frame
-from data_synth.config import FABRICS, PRESETS, SynthConfig
+from data_synth.cloth.wrinkle_relaxation import lift_levels, relax_levels
+from data_synth.config import FABRICS, OTHER_BODIES, PRESETS, MotionConfig, SynthConfig, folded
 from data_synth.scanner.scan import LABEL_BODY, scan_surfaces
 from data_synth.stage import run as synthesise
 from data_synth.take import TakePlan, plan_take, simulate_take, take_rig, take_surfaces
 
+POSES = ("rest", "hanging", "half", "overhead")
+FOLD_UNITS = {"fold_p90_to_median": "", "calm_percent": "%", "fold_height_rms_mm": "mm", "compression_p1": ""}
+"""Means over the poses, and each of them; compression is the first percentile of the least stretch of any face."""
 OVERHEAD_COSINE = 0.5
 """An upper arm that points up steeper than this is overhead."""
 
@@ -45,29 +50,19 @@ class _Job:
     late_start: int | None
 
 
-def run(*, quick: bool = False, frames: int = 120, workers: int = 2) -> list[Metric]:
-    """Simulate and scan takes of two fabrics with two seeds.
+def run(
+    *, quick: bool = False, frames: int = 120, every: int = 1, data: Literal["even", "folds"] = "even", workers: int = 2
+) -> list[Metric]:
+    """Simulate and scan takes of two fabrics with two seeds, or on two bodies in two motions.
 
     Args:
         quick: one small take of 16 frames, the same keys.
         frames: frames of each take.
+        every: simulated frames to a captured one.
+        data: cloth with its excess everywhere alike, or with folds here and there.
     """
-    if quick:
-        small = replace(PRESETS["tiny"], frames=16, capture_every=2)
-        jobs = [_Job(small, scan_every=8, converge_frames=10, late_start=6)]
-    else:
-        base = replace(PRESETS["tshirt-200k"], frames=frames)
-        jobs = [
-            _Job(
-                replace(base, fabric=fabric, seed=seed),
-                scan_every=max(1, frames // 8),
-                converge_frames=40 if seed == 0 else 0,
-                late_start=frames // 3 if seed == 0 else None,
-            )
-            for fabric in ("jersey", "shirt-cotton")
-            for seed in (0, 1)
-        ]
     rows = []
+    jobs = _jobs(frames, every, data, quick=quick)
     for config, row in run_jobs(_measure, jobs, workers=workers, label="Synthetic takes"):
         numbers = ", ".join(f"{key} {value:.4g}" for key, value in row.items())
         Console(stderr=True).print(f"{config.fabric}, seed {config.seed}: {numbers}", soft_wrap=True)
@@ -112,6 +107,36 @@ def run(*, quick: bool = False, frames: int = 120, workers: int = 2) -> list[Met
         Metric("hole_percent_least", least("hole_percent_least"), "%", "higher"),
         Metric("hole_percent_most", worst("hole_percent_most"), "%"),
         Metric("same_seed_same_digest", float(len(digests) == 1), "", "higher"),
+        *(
+            Metric(name, mean(name), FOLD_UNITS[key], "lower" if key == "calm_percent" else "higher")
+            for key in FOLD_UNITS
+            for name in (key, *(f"{key}_{pose}" for pose in POSES))
+        ),
+    ]
+
+
+def _jobs(frames: int, every: int, data: Literal["even", "folds"], *, quick: bool) -> list[_Job]:
+    if quick:
+        small = replace(PRESETS["tiny"], frames=16, capture_every=2)
+        small = small if data == "even" else folded(small)
+        return [_Job(small, scan_every=8, converge_frames=10, late_start=6)]
+    base = replace(PRESETS["tshirt-200k"], frames=frames, capture_every=every)
+    if data == "folds":
+        takes = [
+            replace(folded(base), fabric="jersey"),
+            replace(folded(base), fabric="shirt-cotton", seed=1, body_shape=OTHER_BODIES["heavy"]),
+            replace(folded(base), fabric="shirt-cotton", seed=2, motion=MotionConfig("arm-circles")),
+        ]
+    else:
+        takes = [replace(base, fabric=fabric, seed=seed) for fabric in ("jersey", "shirt-cotton") for seed in (0, 1)]
+    return [
+        _Job(
+            take,
+            scan_every=max(1, frames // 8),
+            converge_frames=40 if take.seed == 0 else 0,
+            late_start=frames // 3 if take.seed == 0 else None,
+        )
+        for take in takes
     ]
 
 
@@ -126,7 +151,7 @@ def _measure(job: _Job) -> tuple[SynthConfig, dict[str, float]]:
         measure_cloth(take.fine, take.wrinkles, fine, take.bodies[take.lead + index].vertices(), faces)
         for index, _, fine in clip
     ]
-    overhead = np.array([_arms_overhead(take, index) for index, _, _ in clip])
+    overhead = np.array([_arms_up(take, index) > OVERHEAD_COSINE for index, _, _ in clip])
     stretch = np.array([quality.stretch_p99 for quality in qualities])
     inside = np.array([quality.inside_body_percent for quality in qualities])
     row = {
@@ -145,6 +170,7 @@ def _measure(job: _Job) -> tuple[SynthConfig, dict[str, float]]:
             [count_intersecting_faces(fine.astype(float), take.fine.faces) for _, _, fine in clip[:: job.scan_every]]
         ),
         "sim_cpu_s": sim_cpu / len(clip),
+        **_folds(take, clip),
         **_scans(take, clip[job.scan_every // 2 :: job.scan_every]),
     }
     if job.late_start is not None:
@@ -171,7 +197,7 @@ def _wrinkles(take: TakePlan, clip: list) -> tuple[np.ndarray, np.ndarray, dict[
         flat = vertex_normals(placed, take.template.faces)[take.template.faces[to_template]]
         flat = np.einsum("vk,vkc->vc", template_weights, flat)
         residuals.append(_angles(normal, flat / np.linalg.norm(flat, axis=1, keepdims=True)).mean())
-        smooth = lift(take.wrinkles, coarse)[1]
+        smooth = lift_levels(take.levels, coarse)[1]
         if before is not None:
             changes.append((_angles(normal, before[0]).mean(), _angles(smooth, before[1]).mean()))
         before = normal, smooth
@@ -179,7 +205,8 @@ def _wrinkles(take: TakePlan, clip: list) -> tuple[np.ndarray, np.ndarray, dict[
     return np.array(residuals), np.array(changes), normals
 
 
-def _arms_overhead(take: TakePlan, index: int) -> bool:
+def _arms_up(take: TakePlan, index: int) -> float:
+    """How steeply the higher upper arm points up: 1 is overhead, 0 level, -1 hanging."""
     body = take.bodies[take.lead + index]
     names, joints = take.shaped.body.joint_names, take.shaped.joints
     up = []
@@ -187,7 +214,28 @@ def _arms_overhead(take: TakePlan, index: int) -> bool:
         shoulder, elbow = names.index(f"upperarm01.{side}"), names.index(f"lowerarm01.{side}")
         arm = body.transforms[shoulder, :3, :3] @ (joints[elbow] - joints[shoulder])
         up.append(arm[1] / np.linalg.norm(arm))
-    return max(up) > OVERHEAD_COSINE
+    return max(up)
+
+
+def _folds(take: TakePlan, clip: list) -> dict[str, float]:
+    """Statistics of the trunk's folds, and compression of the fine cloth in its plane, in four poses of the arms."""
+    up = np.array([_arms_up(take, index) for index, _, _ in clip])
+    hanging = int(np.argmin(up))
+    overhead = hanging + int(np.argmax(up[hanging:]))
+    level = hanging + int(np.argmin(np.abs(up[hanging : overhead + 1])))
+    to_fine, weights = locate(take.fine, take.template.vertex_uv)
+    row: dict[str, float] = {}
+    for pose, position in (("rest", 0), ("hanging", hanging), ("half", level), ("overhead", overhead)):
+        fine = clip[position][2].astype(np.float64)
+        placed = np.einsum("vk,vkc->vc", weights, fine[take.fine.faces[to_fine]])
+        folds = fold_statistics(placed, take.template.faces, torso(placed))
+        row[f"fold_p90_to_median_{pose}"] = folds.p90_to_median
+        row[f"calm_percent_{pose}"] = folds.calm_percent
+        row[f"fold_height_rms_mm_{pose}"] = folds.height_rms_mm
+        row[f"compression_p1_{pose}"] = float(np.percentile(principal_stretches(take.fine, fine)[:, 0], 1))
+    for key in FOLD_UNITS:
+        row[key] = float(np.mean([row[f"{key}_{pose}"] for pose in POSES]))
+    return row
 
 
 def _determinism(job: _Job, normals: dict[int, np.ndarray]) -> float:
@@ -213,12 +261,10 @@ def _determinism(job: _Job, normals: dict[int, np.ndarray]) -> float:
 def _fold_determinism(job: _Job, take: TakePlan, clip: list, normals: dict[int, np.ndarray]) -> float:
     """Mean angle, deg, to folds on the same coarse cloth that start anew a third of the way into the clip."""
     assert job.late_start is not None
-    fabric, offsets, compared = FABRICS[take.config.fabric], None, []
+    offsets, compared = None, []
     late = clip[job.late_start :]
     for index, coarse, _ in late:
-        surface = take.bodies[take.lead + index].vertices()
-        faces = take.shaped.body.template.faces
-        fine, offsets = relax_frame(take.wrinkles, coarse, surface, faces, offsets, fabric, take.config.relaxation)
+        fine, offsets = relax_levels(take.levels, coarse, take.bodies[take.lead + index], offsets)
         if index > (late[0][0] + late[-1][0]) // 2:
             compared.append(_angles(vertex_normals(fine.astype(float), take.fine.faces), normals[index]).mean())
     return float(np.mean(compared))
@@ -238,7 +284,7 @@ def _hem_sag(take: TakePlan, clip: list, frames: int) -> float:
     usual = {index: coarse for index, coarse, _ in clip}
     sags = [
         usual[step - take.lead][hem, 1].mean() - coarse[hem, 1].mean()
-        for step, coarse in enumerate(simulate(take.coarse, start, take.bodies[:stop], fabric, harder))
+        for step, coarse in enumerate(simulate(take.coarse, start, take.bodies[:stop], fabric, harder, made=take.made))
         if step - take.lead in usual
     ]
     return 1e3 * float(np.abs(sags).max())

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import field, replace
 from typing import Annotated, Literal
 
-from capture4d.settings import Count, NonNegative, Number, Positive, Range, Seed, Share, Whole, settings
+from capture4d.settings import Count, NonNegative, Number, Part, Positive, Range, Seed, Share, Whole, settings
 from data_synth.outfits import OutfitName, PrintName
 from data_synth.scanner.config import FusionConfig, RigConfig, ScannerConfig, StereoConfig
 
@@ -65,6 +65,8 @@ class Fabric:
     """Size of the coarse rest pattern across and along the grain; the rest becomes fine folds."""
     fold_bending: Share = 0.17
     """Bending gain of the wrinkle mesh, 0 to 1: more makes wider folds."""
+    grain_bending: Positive = 1.0
+    """Bending stiffness along the grain over that across it, of garments with a `FoldConfig`."""
 
 
 FABRICS = {
@@ -74,6 +76,12 @@ FABRICS = {
     ),
     "linen": Fabric(
         "linen", density=0.18, stretch_stiffness=180.0, coarse_bending=5e-4, fold_bending=0.25, shrink=(0.91, 0.975)
+    ),
+    "denim": Fabric(
+        "denim", density=0.4, stretch_stiffness=400.0, coarse_bending=1.5e-3, fold_bending=0.4, grain_bending=1.8
+    ),
+    "wool": Fabric(
+        "wool", density=0.28, stretch_stiffness=260.0, coarse_bending=8e-4, fold_bending=0.3, grain_bending=1.3
     ),
 }
 
@@ -149,6 +157,59 @@ class RelaxationConfig:
 
 
 @settings
+class FoldConfig:
+    """A garment whose folds are here and there, deep, with calm cloth between; in place of excess cloth everywhere."""
+
+    shrink: tuple[Shrink, Shrink] = (0.949, 0.982)
+    """Size of the coarse rest pattern across and along the grain, in the mean; in place of the fabric's."""
+    calm_shrink: tuple[Shrink, Shrink] = (0.998, 0.998)
+    """The same on chest and shoulder blades of a shirt."""
+    patch_spread: NonNegative = 1.9
+    """Standard deviation of the logarithm of the excess across, from patch to patch."""
+    patch_width_m: tuple[NonNegative, NonNegative] = (0.05, 0.12)
+    """Width of the patches across and along the grain."""
+    most_excess: Part = 0.17
+    """No patch has more than this across."""
+    wide: RelaxationConfig = field(
+        default_factory=lambda: RelaxationConfig(
+            vertices=12_000,
+            sweeps=30,
+            radius_m=0.03,
+            pull_normal=0.0005,
+            imperfection_m=0.005,
+            imperfection_width_m=(0.02, 0.08),
+        )
+    )
+    """Wide folds, on a mesh between the simulated one and that of the fine folds."""
+    wide_share: Share = 0.6
+    """Share of the excess that wide folds take up; the rest is left to fine ones."""
+    wide_bending: Share = 0.17
+    """Bending gain of the wide folds."""
+    last_sweeps: Whole = 80
+    """Sweeps over nearly unbent cloth at the end, in which it gets its lengths back."""
+    last_bending: Share = 0.005
+    """Bending gain in them."""
+    over_relaxation: Annotated[float, Range(least=1, below=2)] = 1.2
+    """Of the lengths in them."""
+    hold_spread: Whole = 25
+    """Passes over the simulated sheet that smooth which limbs its hold follows. Where the skin folds sharply, above a
+    raised shoulder, cloth does not."""
+    strip_m: NonNegative = 0.02
+    """Width of the turned layer along every border."""
+    strip_mass: Annotated[float, Range(least=1)] = 2.0
+    """Mass of it over that of one layer."""
+    strip_bending: Annotated[float, Range(least=1)] = 4.0
+    """Bending stiffness of it over that of one layer."""
+    seam_bending: Annotated[float, Range(least=1)] = 3.0
+    """Bending stiffness of a seam over that of one layer."""
+    strip_thickness_m: NonNegative = 0.001
+    """How far it stands out."""
+    wall_hz: NonNegative = 20.0
+    """Frequency at which cloth of a sleeve that has passed the plane between arm and trunk would swing back; 0 lets
+    sleeve and trunk pass through each other."""
+
+
+@settings
 class SynthConfig:
     """One synthetic take: who, what, how it moves, how it is scanned."""
 
@@ -171,7 +232,7 @@ class SynthConfig:
     """Error of the joint angles in the capture's poses.npz, standard deviation; truth/ holds the exact ones."""
     template_vertices: Vertices = 5000
     """Vertices of the registration template."""
-    fabric: Literal["jersey", "shirt-cotton", "linen"] = "jersey"
+    fabric: Literal["jersey", "shirt-cotton", "linen", "denim", "wool"] = "jersey"
     """What the shirt is made of."""
     style: GarmentStyle = field(default_factory=GarmentStyle)
     outfit: OutfitName = "blue"
@@ -184,7 +245,16 @@ class SynthConfig:
     motion: MotionConfig = field(default_factory=MotionConfig)
     simulation: SimulationConfig = field(default_factory=SimulationConfig)
     relaxation: RelaxationConfig = field(default_factory=RelaxationConfig)
+    folds: FoldConfig | None = None
+    """Folds here and there; if absent, everywhere alike."""
     scanner: ScannerConfig = field(default_factory=ScannerConfig)
+
+
+def folded(config: SynthConfig) -> SynthConfig:
+    """The same take in a garment that folds here and there: its sheet is coarser, for there are two meshes over it, and
+    hangs more freely below the chest."""
+    simulation = replace(config.simulation, vertices=2500, substeps=32, damping=0.993, hold_hz=17.0, hold_floor=0.035)
+    return replace(config, folds=FoldConfig(), simulation=simulation)
 
 
 _FULL = SynthConfig(name="tshirt-200k")
@@ -223,6 +293,7 @@ PRESETS: dict[str, SynthConfig] = {
     "tshirt-200k": replace(_FULL, frames=212),
     "tshirt-cotton-200k": replace(_FULL, name="tshirt-cotton-200k", fabric="shirt-cotton", seed=1),
     "tshirt-linen-200k": replace(_FULL, name="tshirt-linen-200k", fabric="linen", seed=2),
+    "tshirt-folds-200k": folded(replace(_FULL, name="tshirt-folds-200k", frames=212)),
 }
 """Takes by name, from minutes to an hour."""
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, UInt8
@@ -19,8 +19,9 @@ from capture4d.types import Mesh, PoseSequence, Rig
 from data_synth.cloth.panels import Pattern
 from data_synth.cloth.patterns import PanelMesh, grade, mesh_pattern
 from data_synth.cloth.simulation import approach_poses, dress, simulate
+from data_synth.cloth.tailoring import Made, tailor
 from data_synth.cloth.tshirt import tshirt_pattern
-from data_synth.cloth.wrinkle_relaxation import WrinkleMesh, relax_frame, wrinkle_mesh
+from data_synth.cloth.wrinkle_relaxation import Finish, Level, WrinkleMesh, relax_levels, wrinkle_mesh
 from data_synth.config import FABRICS, SynthConfig
 from data_synth.motions import make_motion
 from data_synth.outfits import OUTFITS, Outfit
@@ -42,6 +43,8 @@ __all__ = [
 ]
 
 WHITE = (255, 255, 255)
+WIDE_STREAM = 400
+"""Of a take's seed: the mesh of its wide folds."""
 PRINT_STREAM = 300
 """Added to the seed of a take for that of its print."""
 BORDER_BAND_M = 0.009
@@ -79,6 +82,10 @@ class TakePlan:
     template: PanelMesh
     wrinkles: WrinkleMesh
     paint: Paint
+    levels: tuple[Level, ...]
+    """How the simulated sheet is folded; the last is that of `wrinkles`."""
+    made: Made | None
+    """The making of the coarse mesh; None where `config.folds` is."""
 
     @property
     def lead(self) -> int:
@@ -119,10 +126,14 @@ def plan_take(config: SynthConfig) -> TakePlan:
         "fine": config.relaxation.vertices,
         "template": config.template_vertices,
     }
+    if config.folds is not None:
+        counts["wide"] = config.folds.wide.vertices
+        streams["wide"] = np.random.default_rng([config.seed, WIDE_STREAM])
     first = tshirt_pattern(drafted, config.style)
     meshes = {name: mesh_pattern(first, count, streams[name]) for name, count in counts.items()}
     if config.drafted_for is not None:
         meshes = {name: grade(mesh, first, pattern) for name, mesh in meshes.items()}
+    made, levels = _folded(config, pattern, meshes, streams["imperfection"])
     return TakePlan(
         config=config,
         shaped=shaped,
@@ -132,9 +143,30 @@ def plan_take(config: SynthConfig) -> TakePlan:
         coarse=meshes["coarse"],
         fine=meshes["fine"],
         template=meshes["template"],
-        wrinkles=wrinkle_mesh(meshes["coarse"], meshes["fine"], config.relaxation, streams["imperfection"]),
+        wrinkles=levels[-1].mesh,
         paint=_paint(config, meshes["fine"], shaped),
+        levels=levels,
+        made=made,
     )
+
+
+def _folded(
+    config: SynthConfig, pattern: Pattern, meshes: Mapping[str, PanelMesh], rng: np.random.Generator
+) -> tuple[Made | None, tuple[Level, ...]]:
+    """The making of the coarse mesh, and the levels of folds over it."""
+    folds, fabric = config.folds, FABRICS[config.fabric]
+    if folds is None:
+        mesh = wrinkle_mesh(meshes["coarse"], meshes["fine"], config.relaxation, rng)
+        return None, (Level(mesh, fabric, config.relaxation),)
+    made = {name: Made(tailor(mesh, pattern, folds), folds) for name, mesh in meshes.items() if name != "template"}
+    finish = Finish(folds.last_sweeps, folds.last_bending, folds.over_relaxation)
+    soft = replace(fabric, fold_bending=folds.wide_bending)
+    left = 1 - folds.wide_share
+    wide = wrinkle_mesh(
+        meshes["coarse"], meshes["wide"], folds.wide, rng, fabric=soft, made=made["wide"], excess_left=left
+    )
+    fine = wrinkle_mesh(meshes["wide"], meshes["fine"], config.relaxation, rng, fabric=fabric, made=made["fine"])
+    return made["coarse"], (Level(wide, soft, folds.wide, finish), Level(fine, fabric, config.relaxation, finish))
 
 
 def _paint(config: SynthConfig, fine: PanelMesh, shaped: ShapedBody) -> Paint:
@@ -164,19 +196,17 @@ def simulate_take(take: TakePlan) -> Iterator[tuple[int, np.ndarray, np.ndarray 
         frames the fine cloth (V, 3), else None.
     """
     fabric, lead, offsets = FABRICS[take.config.fabric], take.lead, None
-    faces = take.shaped.body.template.faces
     start = dress(take.shaped, take.coarse, take.pattern, take.bodies[0])
 
     def relax(coarse: np.ndarray, body: PosedBody) -> np.ndarray:
         nonlocal offsets
-        fine, offsets = relax_frame(
-            take.wrinkles, coarse, body.vertices(), faces, offsets, fabric, take.config.relaxation
-        )
+        fine, offsets = relax_levels(take.levels, coarse, body, offsets)
         return fine
 
     with ThreadPoolExecutor(1) as second_core:  # newton and numba both release the interpreter
         waiting = []
-        for step, coarse in enumerate(simulate(take.coarse, start, take.bodies, fabric, take.config.simulation)):
+        sheet = simulate(take.coarse, start, take.bodies, fabric, take.config.simulation, made=take.made)
+        for step, coarse in enumerate(sheet):
             index = step - lead
             captured = index >= 0 and index % take.config.capture_every == 0
             future = second_core.submit(relax, coarse, take.bodies[step]) if captured else None

@@ -15,7 +15,7 @@ from data_synth.cloth.patterns import PanelMesh
 from data_synth.cloth.stencils import rest_areas
 from data_synth.cloth.wrinkle_relaxation import WrinkleMesh
 
-__all__ = ["ClothQuality", "measure_cloth"]
+__all__ = ["ClothQuality", "measure_cloth", "principal_stretches"]
 
 AREA_LIMITS = (0.25, 2.0)
 STRETCH_LIMIT = 1.2
@@ -56,3 +56,17 @@ def measure_cloth(
     if crushed + over > 0.001 * len(area):
         reasons.append(f"{crushed} faces crushed and {over} overstretched")
     return ClothQuality(p99, crushed, over, inside, tuple(reasons))
+
+
+def principal_stretches(mesh: PanelMesh, vertices: np.ndarray) -> np.ndarray:
+    """How much each face of a frame, (V, 3) metres, is longer than on the pattern: least and most over all directions.
+
+    Returns:
+        (F, 2), 1 where the face has its own size; the first column below 1 is compression in the cloth's plane.
+    """
+    rest = np.stack([mesh.uv[:, 1] - mesh.uv[:, 0], mesh.uv[:, 2] - mesh.uv[:, 0]], axis=2)
+    corners = vertices.astype(np.float64)[mesh.faces]
+    sides = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=2)
+    gradient = sides @ np.linalg.inv(rest)
+    squared = np.linalg.eigvalsh(np.einsum("fca,fcb->fab", gradient, gradient))
+    return np.sqrt(np.maximum(squared, 0))

@@ -20,12 +20,13 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from capture4d.body.binding import bind
 from capture4d.body.skinning import PosedBody, ShapedBody, skin, unskin, with_pose
-from capture4d.geometry.mesh import unique_edges, vertex_normals
+from capture4d.geometry.mesh import unique_edges, vertex_adjacency, vertex_normals
 from capture4d.geometry.ray_casting import TriangleScene
 from capture4d.heavy_imports import import_warp
 from capture4d.types import PoseSequence
 from data_synth.cloth.panels import Pattern
 from data_synth.cloth.patterns import PanelMesh, smooth_noise
+from data_synth.cloth.tailoring import Made, Sleeve, Wall, bending_factors, wall_heights, walls
 from data_synth.config import Fabric, SimulationConfig
 
 __all__ = ["approach_poses", "dress", "dressing_rotations", "simulate"]
@@ -35,6 +36,10 @@ DRESSING_ARM_RAISE_DEG = 42.0
 
 LIFT_M = 0.035
 """The panels start this far above their place, clear of the shoulders."""
+WALL_MARGIN_M = 0.005
+"""Room that sleeve and trunk keep to the plane between them, for the folds of both."""
+WALL_OPENING = 0.125
+"""How fast that room grows from the underarm downwards."""
 PILLOW_M = 0.13
 """Distance from the seams over which front and back part."""
 
@@ -188,6 +193,8 @@ def simulate(
     bodies: Sequence[PosedBody],
     fabric: Fabric,
     config: SimulationConfig,
+    *,
+    made: Made | None = None,
 ) -> Iterator[np.ndarray]:
     """Move the cloth through a sequence of body poses, `1 / config.fps` apart.
 
@@ -195,13 +202,14 @@ def simulate(
 
     Args:
         start: (V, 3) cloth in the first frame, metres.
+        made: how the garment was made; of one layer, without a share of its cloth that is the same everywhere, if None.
     Yields:
         Cloth vertices (V, 3) float64 for each frame, the first included.
     """
     import_warp()
     import newton
 
-    model, body = _build_model(mesh, start, bodies, fabric)
+    model, body = _build_model(mesh, start, bodies, fabric, made)
     solver = newton.solvers.SolverVBD(model, iterations=config.iterations)
     pipeline = newton.CollisionPipeline(model, soft_contact_gap=config.contact_gap_m)
     contacts, control = pipeline.contacts(), model.control()
@@ -215,9 +223,11 @@ def simulate(
         previous, current = current, bodies[frame].vertices()
         if frame == config.calm_frames and config.hold_hz > 0:
             cloth = state.particle_q.numpy().astype(np.float64)
-            hold = _Hold.take(mesh, cloth, bodies[frame - 1], model.particle_mass.numpy(), config)
+            spread = 0 if made is None else made.folds.hold_spread
+            hold = _Hold.take(mesh, cloth, bodies[frame - 1], model.particle_mass.numpy(), config, spread)
         held = None if hold is None else (hold.places(bodies[frame - 1]), hold.places(bodies[frame]))
         calm = frame <= config.calm_frames
+        between = _Walls.of(made, bodies[frame], model.particle_mass.numpy())
         model.set_gravity(tuple(gravity * (0.5 if calm else 1.0)))
         for substep in range(config.substeps):
             blend = (substep + 1) / config.substeps
@@ -228,7 +238,11 @@ def simulate(
             state.clear_forces()
             if hold is not None and held is not None:
                 places = (1 - blend) * held[0] + blend * held[1]
-                state.particle_f.assign((hold.stiffness * (places - state.particle_q.numpy())).astype(np.float32))
+                points = state.particle_q.numpy()
+                forces = hold.stiffness * (places - points)
+                if between is not None:
+                    between.push(points, forces)
+                state.particle_f.assign(forces.astype(np.float32))
             if substep % config.contact_substeps == 0:
                 pipeline.collide(state, contacts)
             solver.step(state, scratch, control, contacts, step)
@@ -257,10 +271,23 @@ class _Hold:
 
     @staticmethod
     def take(
-        mesh: PanelMesh, cloth: np.ndarray, body: PosedBody, masses: np.ndarray, config: SimulationConfig
+        mesh: PanelMesh,
+        cloth: np.ndarray,
+        body: PosedBody,
+        masses: np.ndarray,
+        config: SimulationConfig,
+        spread: int,
     ) -> _Hold:
-        """Hold the cloth, (V, 3) with limbs well apart, where it is on the body now; firmest at the shoulders."""
+        """Hold the cloth, (V, 3) with limbs well apart, where it is on the body now; firmest at the shoulders.
+
+        Args:
+            spread: passes that smooth the skin weights over the cloth.
+        """
         _, _, weights = bind(cloth, mesh.faces, body)
+        adjacency = vertex_adjacency(mesh.faces, mesh.vertex_count).astype(np.float64)
+        around = np.asarray(adjacency.sum(axis=1)).reshape(-1, 1)
+        for _ in range(spread):
+            weights = 0.5 * weights + 0.5 * (adjacency @ weights) / around
         rest, flagged = unskin(cloth, weights, body.transforms)
         assert not flagged.any(), "the dressing pose cannot be unposed"
         bumps = smooth_noise(mesh.noise_uv, config.hold_ripple_m, config.hold_ripple_width_m, np.random.default_rng(1))
@@ -275,7 +302,38 @@ class _Hold:
         return skin(self.rest, self.skin_weights, body.transforms)
 
 
-def _build_model(mesh: PanelMesh, start: np.ndarray, bodies: Sequence[PosedBody], fabric: Fabric) -> tuple[Any, Any]:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Walls:
+    """Soft planes between the arms of one pose and the trunk: a sleeve stays on its own side, the trunk on the other.
+
+    They stand in for contact of cloth with cloth where it shows most.
+    """
+
+    sleeves: tuple[Sleeve, ...]
+    planes: tuple[Wall, ...]
+    stiffness: np.ndarray
+    """(V,) N/m."""
+
+    @staticmethod
+    def of(made: Made | None, body: PosedBody, masses: np.ndarray) -> _Walls | None:
+        if made is None or not made.folds.wall_hz:
+            return None
+        sleeves = made.tailoring.sleeves
+        return _Walls(sleeves, walls(sleeves, body), (2 * np.pi * made.folds.wall_hz) ** 2 * masses)
+
+    def push(self, points: np.ndarray, forces: np.ndarray) -> None:
+        """Add to forces, (V, 3) N, what drives cloth at some points, (V, 3), back to its side."""
+        for sleeve, wall in zip(self.sleeves, self.planes, strict=True):
+            heights, below = wall_heights(points, sleeve, wall)
+            depth = np.minimum(WALL_MARGIN_M, WALL_OPENING * below) - heights
+            deep = (below > 0) & (depth > 0)
+            rows, away = sleeve.rows[deep], (sleeve.signs * depth)[deep]
+            forces[rows] += (self.stiffness[rows] * away)[:, None] * wall.normal
+
+
+def _build_model(
+    mesh: PanelMesh, start: np.ndarray, bodies: Sequence[PosedBody], fabric: Fabric, made: Made | None
+) -> tuple[Any, Any]:
     """newton's model of cloth and collider, and the collider whose points each substep moves."""
     import newton
 
@@ -296,7 +354,7 @@ def _build_model(mesh: PanelMesh, start: np.ndarray, bodies: Sequence[PosedBody]
         edge_kd=1e-3,
         particle_radius=0.003,
     )
-    a, b, c = (mesh.uv * fabric.shrink).transpose(1, 0, 2)
+    a, b, c = (mesh.uv * (fabric.shrink if made is None else made.tailoring.scale)).transpose(1, 0, 2)
     length = np.linalg.norm(b - a, axis=1)
     along = (b - a) / length[:, None]
     side = c - a
@@ -309,6 +367,13 @@ def _build_model(mesh: PanelMesh, start: np.ndarray, bodies: Sequence[PosedBody]
     builder.tri_areas = areas.tolist()
     builder.edge_rest_angle = [0.0] * len(builder.edge_rest_angle)
     mass = np.bincount(mesh.faces.ravel(), np.repeat(areas * fabric.density / 3, 3), minlength=mesh.vertex_count)
+    if made is not None:
+        mass *= np.where(made.tailoring.strip, made.folds.strip_mass, 1)
+        factors = bending_factors(mesh, made, fabric, np.array(builder.edge_indices)[:, 2:])
+        builder.edge_bending_properties = [
+            (stiffness * factor, damping)
+            for factor, (stiffness, damping) in zip(factors.tolist(), builder.edge_bending_properties, strict=True)
+        ]
     builder.particle_mass = mass.tolist()
     faces = bodies[0].shaped.body.template.faces
     body = newton.Mesh(bodies[0].vertices().astype(np.float32), faces.ravel(), compute_inertia=False)

@@ -14,18 +14,35 @@ Boubekeur and Alexa (2008).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 
+from capture4d.body.skinning import PosedBody
 from capture4d.geometry.mesh import vertex_adjacency, vertex_normals
 from capture4d.geometry.ray_casting import TriangleScene, barycentric
 from data_synth.cloth.patterns import PanelMesh, locate, smooth_noise
 from data_synth.cloth.stencils import hinges, rest_lengths
+from data_synth.cloth.tailoring import Made, Sleeve, Wall, bending_factors, shrunk, wall_heights, walls
+from data_synth.cloth.tightening import tighten
 from data_synth.config import Fabric, RelaxationConfig
 
-__all__ = ["BodyPlanes", "BodySurface", "WrinkleMesh", "relax_frame", "wrinkle_mesh"]
+__all__ = [
+    "BodyPlanes",
+    "BodySurface",
+    "Finish",
+    "Level",
+    "WrinkleMesh",
+    "lift_levels",
+    "relax_frame",
+    "relax_levels",
+    "wrinkle_mesh",
+]
+
+FOLD_ROOM_M = 0.015
+"""Cloth as near to the plane between arm and trunk stays on its side of it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,6 +69,29 @@ class WrinkleMesh:
     """(Q, 5) float32: the bending stencil, and one over its squared norm."""
     imperfection: np.ndarray
     """(V,) float32 offset along the normal from which folds start, metres."""
+    sleeves: tuple[Sleeve, ...] = ()
+    """What must not pass through each other."""
+    raised: np.ndarray | None = None
+    """(V,) how far a turned layer stands out, metres."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Finish:
+    """What a frame's folds end with: sweeps over nearly unbent cloth."""
+
+    sweeps: int
+    bending: float
+    over_relaxation: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Level:
+    """Folds of one width: a mesh over the level before, or over the simulated sheet, and how it is relaxed."""
+
+    mesh: WrinkleMesh
+    fabric: Fabric
+    config: RelaxationConfig
+    finish: Finish | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,15 +104,30 @@ class BodyPlanes:
     """(V, 3) smooth body normals there."""
 
 
-def wrinkle_mesh(coarse: PanelMesh, fine: PanelMesh, config: RelaxationConfig, rng: np.random.Generator) -> WrinkleMesh:
+def wrinkle_mesh(
+    coarse: PanelMesh,
+    fine: PanelMesh,
+    config: RelaxationConfig,
+    rng: np.random.Generator,
+    *,
+    fabric: Fabric | None = None,
+    made: Made | None = None,
+    excess_left: float = 0.0,
+) -> WrinkleMesh:
     """Precompute the stencils of a fine mesh over a coarse one of the same pattern.
 
     Args:
         rng: draws the imperfection; one seed is one garment.
+        fabric: what of, and made: how the garment was made, on the fine mesh; alike everywhere where None.
+        excess_left: share of its excess cloth that is left to the next level.
     """
     lift_faces, lift_weights = locate(coarse, fine.vertex_uv)
-    edges, lengths = rest_lengths(fine)
+    edges, lengths = rest_lengths(fine if made is None else shrunk(fine, made.tailoring.scale, excess_left))
     stencils, weights = hinges(fine)
+    if made is not None and fabric is not None:
+        # A projection of the whole bend is all that a sweep can do.
+        factors = np.minimum(bending_factors(fine, made, fabric, stencils[:, :2]), 1 / max(fabric.fold_bending, 1e-6))
+        weights[:, 4] *= factors
     adjacency = vertex_adjacency(fine.faces, fine.vertex_count)
     neighbour = adjacency.indices[adjacency.indptr[:-1]]
     return WrinkleMesh(
@@ -86,6 +141,8 @@ def wrinkle_mesh(coarse: PanelMesh, fine: PanelMesh, config: RelaxationConfig, r
         hinges=stencils.astype(np.int32),
         hinge_weights=weights.astype(np.float32),
         imperfection=smooth_noise(fine.noise_uv, config.imperfection_m, config.imperfection_width_m, rng),
+        sleeves=() if made is None else made.tailoring.sleeves,
+        raised=None if made is None else np.where(made.tailoring.strip, made.folds.strip_thickness_m, 0.0),
     )
 
 
@@ -135,24 +192,54 @@ def _may_touch(mesh: WrinkleMesh, coarse: np.ndarray, base: np.ndarray, body: Bo
     return np.flatnonzero((distance - way).max(axis=1) < reach)
 
 
+def relax_levels(
+    levels: Sequence[Level], coarse: np.ndarray, body: PosedBody, previous: Sequence[np.ndarray] | None
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Fold one coarse frame, (C, 3), level by level, the widest folds first.
+
+    Args:
+        previous: what the call for the frame before returned; None to start anew.
+    Returns:
+        Vertices of the last level, (V, 3) float32, and the offsets of each, as `relax_frame` returns them.
+    """
+    surface = BodySurface.create(body.vertices(), body.shaped.body.template.faces)
+    offsets, sheet = [], coarse
+    between = walls(levels[0].mesh.sleeves, body)
+    for number, level in enumerate(levels):
+        sheet, offset = relax_frame(level, sheet, surface, None if previous is None else previous[number], between)
+        offsets.append(offset)
+    raised = levels[-1].mesh.raised
+    if raised is not None:
+        outwards = vertex_normals(sheet.astype(np.float64), levels[-1].mesh.faces)
+        sheet = (sheet + raised[:, None] * outwards).astype(np.float32)
+    return sheet, offsets
+
+
+def lift_levels(levels: Sequence[Level], coarse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Place the finest mesh on a coarse frame without any folds; positions and normals, as `lift` returns them."""
+    for level in levels[:-1]:
+        coarse, _ = lift(level.mesh, coarse)
+    return lift(levels[-1].mesh, coarse)
+
+
 def relax_frame(
-    mesh: WrinkleMesh,
+    level: Level,
     coarse: np.ndarray,
-    surface: np.ndarray,
-    body_faces: np.ndarray,
+    body: BodySurface,
     previous_offsets: np.ndarray | None,
-    fabric: Fabric,
-    config: RelaxationConfig,
+    between: Sequence[Wall] = (),
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Fold the fine mesh over one coarse frame.
+    """Fold the mesh of a level over one coarse frame.
 
     Args:
         coarse: (C, 3) coarse cloth.
-        surface: (B, 3) body surface of the same frame.
+        body: surface of the same frame.
         previous_offsets: what the call for the frame before returned; None to start anew, with more sweeps.
+        between: the planes beside the mesh's sleeves.
     Returns:
         Fine vertices (V, 3) float32, and their offsets from the lifted sheet in material frames, (V, 3) float32.
     """
+    mesh, config = level.mesh, level.config
     base, normals = lift(mesh, coarse)
     frames = _material_frames(mesh, base, normals)
     offsets = np.zeros((len(base), 3))
@@ -163,12 +250,12 @@ def relax_frame(
     else:
         offsets = config.warm_start * previous_offsets + (1 - config.warm_start) * offsets
     points = (base + np.einsum("vji,vj->vi", frames, offsets)).astype(np.float32)
-    body = BodySurface.create(surface, body_faces)
     near = _may_touch(mesh, coarse, base, body, config.radius_m + 2 * config.body_margin_m)
     plane_points, plane_normals = (base - normals).astype(np.float32), normals.astype(np.float32)  # out of the way
     for planes_at in (base, points):  # the body is a half plane per vertex, so it is looked up again half-way
         planes = body.planes(planes_at[near])
         plane_points[near], plane_normals[near] = planes.points, planes.normals
+        _stand_walls(mesh.sleeves, between, planes_at, plane_points, plane_normals)
         _relax(
             points,
             base.astype(np.float32),
@@ -177,7 +264,7 @@ def relax_frame(
             mesh.rest_lengths,
             mesh.hinges,
             mesh.hinge_weights,
-            np.float32(fabric.fold_bending),
+            np.float32(level.fabric.fold_bending),
             np.float32(config.pull_normal),
             np.float32(config.pull_tangential),
             np.float32(config.radius_m),
@@ -186,10 +273,42 @@ def relax_frame(
             np.float32(config.body_margin_m),
             (sweeps + 1) // 2,
         )
+    if level.finish is not None:
+        tighten(
+            points,
+            base.astype(np.float32),
+            np.float32(1.2 * config.radius_m),
+            mesh.edges,
+            mesh.rest_lengths,
+            np.float32(level.finish.over_relaxation),
+            mesh.hinges,
+            mesh.hinge_weights,
+            np.float32(level.finish.bending),
+            plane_points,
+            plane_normals,
+            np.float32(config.body_margin_m),
+            level.finish.sweeps,
+        )
     planes = body.planes(points[near])
     depth = np.einsum("vc,vc->v", points[near] - planes.points, planes.normals) - 0.2 * config.body_margin_m
     points[near] -= (np.minimum(depth, 0)[:, None] * planes.normals).astype(np.float32)
     return points, np.einsum("vij,vj->vi", frames, points - base).astype(np.float32)
+
+
+def _stand_walls(
+    sleeves: Sequence[Sleeve],
+    between: Sequence[Wall],
+    points: np.ndarray,
+    plane_points: np.ndarray,
+    plane_normals: np.ndarray,
+) -> None:
+    """Write the wall beside a sleeve over the half plane, (V, 3) each, of every vertex that is nearer to the wall."""
+    for sleeve, wall in zip(sleeves, between, strict=True):
+        heights, below = wall_heights(points, sleeve, wall)
+        over_body = np.einsum("nc,nc->n", points[sleeve.rows] - plane_points[sleeve.rows], plane_normals[sleeve.rows])
+        near = (below > 0) & (heights < np.minimum(over_body, FOLD_ROOM_M))
+        rows, normals = sleeve.rows[near], sleeve.signs[near, None] * wall.normal
+        plane_normals[rows], plane_points[rows] = normals, points[rows] - heights[near, None] * normals
 
 
 def _material_frames(mesh: WrinkleMesh, base: np.ndarray, normals: np.ndarray) -> np.ndarray:

@@ -10,13 +10,22 @@ import pytest
 
 from data_synth.cloth.panels import Edge, Panel, Pattern
 from data_synth.cloth.patterns import PanelMesh, mesh_pattern
-from data_synth.cloth.quality import measure_cloth
-from data_synth.cloth.wrinkle_relaxation import WrinkleMesh, lift, relax_frame, wrinkle_mesh
+from data_synth.cloth.quality import measure_cloth, principal_stretches
+from data_synth.cloth.wrinkle_relaxation import (
+    BodySurface,
+    Finish,
+    Level,
+    WrinkleMesh,
+    lift,
+    relax_frame,
+    wrinkle_mesh,
+)
 from data_synth.config import Fabric, RelaxationConfig
 
 SIDE = 0.3
 FAR_BODY = np.array([[-9.0, -9.0, -9.0], [9.0, -9.0, -9.0], [0.0, 9.0, -9.0]])
 BODY_FACES = np.array([[0, 1, 2]], np.int32)
+FAR = BodySurface.create(FAR_BODY, BODY_FACES)
 
 
 def square(vertices: int, seed: int) -> PanelMesh:
@@ -33,6 +42,10 @@ def sheets() -> tuple[PanelMesh, PanelMesh, WrinkleMesh]:
 
 def flat(mesh: PanelMesh, width: float = 1.0) -> np.ndarray:
     return np.column_stack([mesh.vertex_uv * [width, 1], np.zeros(mesh.vertex_count)])
+
+
+def usual(wrinkles: WrinkleMesh) -> Level:
+    return Level(wrinkles, Fabric(), RelaxationConfig())
 
 
 def test_rest_lengths_are_those_of_the_pattern(sheets) -> None:
@@ -64,7 +77,7 @@ def test_a_plane_is_lifted_to_itself(sheets) -> None:
 def test_compressed_cloth_folds_until_its_edges_have_their_length(sheets) -> None:
     coarse, fine, wrinkles = sheets
     settings = RelaxationConfig(sweeps=60)
-    folded, _ = relax_frame(wrinkles, flat(coarse, 0.93), FAR_BODY, BODY_FACES, None, Fabric(), settings)
+    folded, _ = relax_frame(Level(wrinkles, Fabric(), settings), flat(coarse, 0.93), FAR, None)
     ends = folded[wrinkles.edges]
     stretch = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / wrinkles.rest_lengths
     assert np.percentile(stretch, 5) > 0.97, "7 % of the width should have gone into folds"
@@ -73,12 +86,32 @@ def test_compressed_cloth_folds_until_its_edges_have_their_length(sheets) -> Non
     assert np.abs(folded - flat(fine, 0.93)).max() < 1.5 * settings.radius_m
 
 
+def test_the_last_sweeps_give_cloth_its_lengths_back_sooner_over_relaxed(sheets) -> None:
+    coarse, fine, wrinkles = sheets
+    shortest = []
+    for finish in (None, Finish(15, 0.005, 1.0), Finish(15, 0.005, 1.6)):
+        level = Level(wrinkles, Fabric(), RelaxationConfig(sweeps=10, start_sweeps_factor=2), finish)
+        folded, _ = relax_frame(level, flat(coarse, 0.93), FAR, None)
+        shortest.append(np.percentile(principal_stretches(fine, folded)[:, 0], 5))
+    assert shortest[0] < shortest[1] < shortest[2] < 1.0
+
+
+@pytest.mark.parametrize("turned_deg", [0.0, 33.0])
+def test_principal_stretches_are_those_of_an_affine_map(sheets, turned_deg: float) -> None:
+    _, fine, _ = sheets
+    turn = np.radians(turned_deg)
+    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    plane = fine.vertex_uv @ rotation * [0.9, 1.1]
+    placed = np.column_stack([plane[:, 0], 0.6 * plane[:, 1], 0.8 * plane[:, 1]])
+    np.testing.assert_allclose(principal_stretches(fine, placed), np.tile([0.9, 1.1], (len(fine.faces), 1)), rtol=1e-9)
+
+
 def test_stiffer_cloth_has_fewer_folds(sheets) -> None:
     coarse, _, wrinkles = sheets
     roughness = []
     for bending in (0.05, 0.6):
         fabric = replace(Fabric(), fold_bending=bending)
-        folded, _ = relax_frame(wrinkles, flat(coarse, 0.93), FAR_BODY, BODY_FACES, None, fabric, RelaxationConfig())
+        folded, _ = relax_frame(Level(wrinkles, fabric, RelaxationConfig()), flat(coarse, 0.93), FAR, None)
         bent = np.einsum("qk,qkc->qc", wrinkles.hinge_weights[:, :4], folded[wrinkles.hinges])
         roughness.append(float(np.abs(bent).mean()))
     assert roughness[1] < 0.7 * roughness[0]
@@ -87,7 +120,7 @@ def test_stiffer_cloth_has_fewer_folds(sheets) -> None:
 def test_cloth_stays_outside_the_body(sheets) -> None:
     coarse, _, wrinkles = sheets
     body = np.array([[-9.0, -9.0, 0.001], [9.0, -9.0, 0.001], [0.0, 9.0, 0.001]])  # 1 mm into the sheet
-    folded, _ = relax_frame(wrinkles, flat(coarse, 0.93), body, BODY_FACES, None, Fabric(), RelaxationConfig())
+    folded, _ = relax_frame(usual(wrinkles), flat(coarse, 0.93), BodySurface.create(body, BODY_FACES), None)
     assert folded[:, 2].min() > 0.001
 
 
@@ -99,17 +132,14 @@ def test_folds_of_two_starts_meet(sheets) -> None:
     for start in (0, 15):
         offsets = None
         for frame in frames[start:]:
-            folded, offsets = relax_frame(wrinkles, frame, FAR_BODY, BODY_FACES, offsets, Fabric(), RelaxationConfig())
+            folded, offsets = relax_frame(usual(wrinkles), frame, FAR, offsets)
         ends.append(folded)
     assert np.abs(ends[0] - ends[1])[:, 2].mean() < 0.25 * np.abs(ends[0][:, 2]).mean()
 
 
 def test_equal_input_gives_equal_bits(sheets) -> None:
     coarse, _, wrinkles = sheets
-    first, second = (
-        relax_frame(wrinkles, flat(coarse, 0.95), FAR_BODY, BODY_FACES, None, Fabric(), RelaxationConfig())[0]
-        for _ in range(2)
-    )
+    first, second = (relax_frame(usual(wrinkles), flat(coarse, 0.95), FAR, None)[0] for _ in range(2))
     np.testing.assert_array_equal(first, second)
 
 
