@@ -239,7 +239,7 @@ PRESETS: dict[str, SynthConfig] = {
 }
 """Takes by name, from minutes to an hour."""
 
-_AT_WAIST = {"hold_hz": 50.0, "hold_depth_m": 0.04, "hold_floor": 0.02, "hold_ripple_m": 0.0}
+_AT_WAIST = {"hold_hz": 80.0, "hold_depth_m": 0.04, "hold_floor": 0.02, "hold_ripple_m": 0.0}
 """A waistband keeps its seat with a hold as firm as this: its few centimetres carry the whole garment."""
 _WHOLE_PERSON = ScannerConfig(rig=RigConfig(image_size=800))
 """Cameras stand farther away where the whole person is in view, and need more pixels."""
@@ -248,7 +248,7 @@ _TROUSERS = replace(
     _FULL,
     name="trousers-200k",
     garment="trousers",
-    cut=("ease=0.16",),  # at the 0.1 of a still person, squatting stretches the seat by a fifth
+    cut=("ease=0.2",),  # at the 0.1 of a still person, squatting stretches the seat by a fifth
     fabric="twill",
     frames=186,
     motion=MotionConfig("range-of-legs"),
@@ -265,13 +265,17 @@ def _small(full: SynthConfig, name: str, motion: ClipName) -> SynthConfig:
     return replace(
         full,
         name=name,
-        frames=20,
-        capture_every=3,
+        frames=14,
+        capture_every=4,
         template_vertices=tiny.template_vertices,
         motion=MotionConfig(motion),
         simulation=coarse if full.garment == "shirt" else replace(coarse, **_AT_WAIST),
         relaxation=tiny.relaxation,
-        scanner=replace(tiny.scanner, rig=replace(tiny.scanner.rig, image_size=400)),
+        scanner=replace(
+            tiny.scanner,
+            rig=RigConfig(cameras=32, image_size=400 if full.garment == "shirt" else 600),
+            fusion=replace(tiny.scanner.fusion, body_voxel_m=0.007, min_component_faces=60),
+        ),
     )
 
 

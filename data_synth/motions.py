@@ -62,7 +62,7 @@ _STANDING = {
     "ankle_both": 0.0, "forward_both": 0.0,
 }  # fmt: skip
 _SQUATTING = {
-    "tilt": 28.0, "bend": 18.0, "leg_both": 96.0, "knee_both": 96.0, "ankle_both": 28.0, "spread_both": 14.0,
+    "tilt": 26.0, "bend": 16.0, "leg_both": 88.0, "knee_both": 88.0, "ankle_both": 26.0, "spread_both": 14.0,
     "forward_both": 70.0,
 }  # fmt: skip
 _LUNGING = {

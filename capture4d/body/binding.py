@@ -39,18 +39,23 @@ OFFSET_SMOOTHING = 12
 
 
 def bind(
-    vertices: Float[np.ndarray, "verts 3"], faces: Int32[np.ndarray, "faces 3"], body: PosedBody
+    vertices: Float[np.ndarray, "verts 3"],
+    faces: Int32[np.ndarray, "faces 3"],
+    body: PosedBody,
+    *,
+    smoothing: int = WEIGHT_SMOOTHING,
 ) -> tuple[Int32[np.ndarray, " verts"], Float32[np.ndarray, "verts 3"], Float[np.ndarray, "verts joints"]]:
     """The nearest body point of each vertex, as face and barycentric coordinates, and smooth skin weights.
 
     Args:
         vertices: on the body, best in a pose where the limbs are well apart.
+        smoothing: diffusion steps on the weights; 0 moves each vertex exactly as the skin beneath it.
     """
     body_faces = body.shaped.body.template.faces
     nearest = TriangleScene((body.vertices(), body_faces)).nearest(vertices)
     within = barycentric(nearest.uv)
     weights = np.einsum("vk,vkj->vj", within, body.shaped.body.skin_weights[body_faces[nearest.faces]])
-    weights = diffuse(weights, faces, WEIGHT_SMOOTHING)
+    weights = diffuse(weights, faces, smoothing)
     return nearest.faces, within, weights / weights.sum(axis=1, keepdims=True)
 
 

@@ -252,7 +252,7 @@ def name_loops(
 def _is_at_hips(loop: np.ndarray, body: Body) -> bool:
     """Whether a loop around the trunk, (N, 3) at rest, is nearer to the hips than to the neck."""
     hips, neck = (body.joints[_named(body, pattern), 1] for pattern in (LEG, NECK))
-    return len(hips) > 0 and len(neck) > 0 and float(loop[:, 1].mean()) < (hips.max() + neck.min()) / 2
+    return len(hips) > 0 and len(neck) > 0 and float(loop[:, 1].mean()) < float(hips.max() + neck.min()) / 2
 
 
 def _share(weights: np.ndarray, body: Body, pattern: str) -> float:

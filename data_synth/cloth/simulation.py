@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation, Slerp
 
-from capture4d.body.binding import bind
+from capture4d.body.binding import WEIGHT_SMOOTHING, bind
 from capture4d.body.skinning import PosedBody, ShapedBody, skin, unskin, with_pose
 from capture4d.geometry.mesh import unique_edges, vertex_normals
 from capture4d.geometry.ray_casting import TriangleScene
@@ -282,7 +282,8 @@ class _Hold:
     ) -> _Hold:
         """Hold the cloth, (V, 3) with limbs well apart, where it is on the body now; firmest at the shoulders, or from
         another height upwards."""
-        _, _, weights = bind(cloth, mesh.faces, body)
+        # Diffused over a coarse sheet, weights would let the thighs turn a waistband.
+        _, _, weights = bind(cloth, mesh.faces, body, smoothing=WEIGHT_SMOOTHING if held_from is None else 0)
         rest, flagged = unskin(cloth, weights, body.transforms)
         assert not flagged.any(), "the dressing pose cannot be unposed"
         bumps = smooth_noise(mesh.noise_uv, config.hold_ripple_m, config.hold_ripple_width_m, np.random.default_rng(1))
