@@ -47,6 +47,8 @@ PRINT_STREAM = 300
 """Added to the seed of a take for that of its print."""
 BORDER_BAND_M = 0.009
 """Width of the painted border."""
+WIDE_BAND_M = 0.015
+"""The same of trousers and skirts: the rig stands farther away, and loses more of what is at an edge."""
 RIG_RADIUS_M = 0.58
 """Smallest sphere the rig is set up for: the upper body with room for the garment."""
 
@@ -143,7 +145,8 @@ def plan_take(config: SynthConfig) -> TakePlan:
 
 
 def _paint(config: SynthConfig, fine: PanelMesh, shaped: ShapedBody) -> Paint:
-    outfit, is_border = OUTFITS[config.outfit], painted_band(fine)
+    outfit = OUTFITS[config.outfit]
+    is_border = painted_band(fine, WIDE_BAND_M if is_held_at_waist(config) else BORDER_BAND_M)
     cloth = outfit.garment if config.print is None else WHITE
     garment = np.where(is_border[:, None], outfit.border, cloth).astype(np.uint8)
     return Paint(garment, is_border, dress_colours(shaped, outfit), _print(config, outfit, fine, is_border))
@@ -211,11 +214,11 @@ def measured_poses(take: TakePlan) -> PoseSequence:
     )
 
 
-def painted_band(mesh: PanelMesh) -> np.ndarray:
+def painted_band(mesh: PanelMesh, width_m: float = BORDER_BAND_M) -> np.ndarray:
     """The vertices, (V,) bool, in the painted band along every border of the pattern."""
     border = np.concatenate(list(mesh.loops.values()))
     corners = np.isin(mesh.faces, border)
-    return KDTree(mesh.uv[corners]).query(mesh.vertex_uv, distance_upper_bound=BORDER_BAND_M)[0] < BORDER_BAND_M
+    return KDTree(mesh.uv[corners]).query(mesh.vertex_uv, distance_upper_bound=width_m)[0] < width_m
 
 
 def dress_colours(shaped: ShapedBody, outfit: Outfit) -> np.ndarray:
