@@ -31,7 +31,8 @@ def cached_training_set(config: TrainingSetConfig, *, workers: int = 2) -> Path:
 
 def _folder(config: SynthConfig | TrainingSetConfig, schema: int) -> Path:
     known = json.dumps([schema, asdict(config)], sort_keys=True)
-    for later in ("print", "print_mm", "folds"):  # takes were made, and are kept, before there were these
+    # Takes were made, and are kept, before there were prints, other garments, and folds here and there.
+    for later in ("print", "print_mm", "garment", "cut", "skirt_weights", "folds"):
         known = known.replace(f', "{later}": null', "")
     key = hashlib.sha256(known.encode()).hexdigest()[:12]
     return user_cache_folder() / "takes" / f"{config.name}-{key}"

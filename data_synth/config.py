@@ -10,8 +10,10 @@ from data_synth.outfits import OutfitName, PrintName
 from data_synth.scanner.config import FusionConfig, RigConfig, ScannerConfig, StereoConfig
 
 ClipName = Literal[
-    "range-of-motion", "twist", "reach", "side-bend", "walk", "hop", "arm-circles", "reach-twist", "sampled"
-]
+    "range-of-motion", "twist", "reach", "side-bend", "walk", "hop", "arm-circles", "reach-twist", "lunge", "squat",
+    "sit", "reach-down", "range-of-legs", "sampled",
+]  # fmt: skip
+GarmentKind = Literal["shirt", "trousers", "skirt"]
 
 Vertices = Annotated[int, Range(least=100)]  # fewer are too few to sew a shirt from
 Shrink = Annotated[float, Range(above=0, most=1)]
@@ -82,6 +84,9 @@ FABRICS = {
     ),
     "wool": Fabric(
         "wool", density=0.28, stretch_stiffness=260.0, coarse_bending=8e-4, fold_bending=0.3, grain_bending=1.3
+    ),
+    "twill": Fabric(
+        "twill", density=0.28, stretch_stiffness=280.0, coarse_bending=8e-4, fold_bending=0.25, shrink=(0.95, 0.985)
     ),
 }
 
@@ -232,8 +237,16 @@ class SynthConfig:
     """Error of the joint angles in the capture's poses.npz, standard deviation; truth/ holds the exact ones."""
     template_vertices: Vertices = 5000
     """Vertices of the registration template."""
-    fabric: Literal["jersey", "shirt-cotton", "linen", "denim", "wool"] = "jersey"
-    """What the shirt is made of."""
+    fabric: Literal["jersey", "shirt-cotton", "linen", "denim", "wool", "twill"] = "jersey"
+    """What the garment is made of."""
+    garment: GarmentKind | None = None
+    """What is worn instead of a T-shirt: a shirt with long sleeves, trousers, or a skirt."""
+    cut: tuple[str, ...] | None = None
+    """Of such a garment, NAME=VALUE each, as `synth-drapes --style` takes them: size, ease, and what else its pattern
+    has."""
+    skirt_weights: Literal["distance", "root"] | None = None
+    """How the template of a skirt follows the body: by the mean of the skin around it, weighted by inverse distance
+    (also if absent), or the hips alone."""
     style: GarmentStyle = field(default_factory=GarmentStyle)
     outfit: OutfitName = "blue"
     """Colours of garment, border paint and suit."""
@@ -296,6 +309,55 @@ PRESETS: dict[str, SynthConfig] = {
     "tshirt-folds-200k": folded(replace(_FULL, name="tshirt-folds-200k", frames=212)),
 }
 """Takes by name, from minutes to an hour."""
+
+_AT_WAIST = {"hold_hz": 80.0, "hold_depth_m": 0.04, "hold_floor": 0.02, "hold_ripple_m": 0.0}
+"""A waistband keeps its seat with a hold as firm as this: its few centimetres carry the whole garment."""
+_WHOLE_PERSON = ScannerConfig(rig=RigConfig(image_size=800))
+"""Cameras stand farther away where the whole person is in view, and need more pixels."""
+_SHIRT = replace(_FULL, name="shirt-200k", garment="shirt", fabric="shirt-cotton", frames=212)
+_TROUSERS = replace(
+    _FULL,
+    name="trousers-200k",
+    garment="trousers",
+    cut=("ease=0.2",),  # at the 0.1 of a still person, squatting stretches the seat by a fifth
+    fabric="twill",
+    frames=186,
+    motion=MotionConfig("range-of-legs"),
+    simulation=SimulationConfig(**_AT_WAIST),
+    scanner=_WHOLE_PERSON,
+)
+_SKIRT = replace(_TROUSERS, name="skirt-200k", garment="skirt", cut=None, fabric="shirt-cotton")
+
+
+def _small(full: SynthConfig, name: str, motion: ClipName) -> SynthConfig:
+    """The same garment as coarse as the preset `tiny`, in the first second of a clip."""
+    tiny = PRESETS["tiny"]
+    coarse = replace(tiny.simulation, vertices=1200, calm_frames=14, approach_frames=8, rest_frames=4)
+    return replace(
+        full,
+        name=name,
+        frames=14,
+        capture_every=4,
+        template_vertices=tiny.template_vertices,
+        motion=MotionConfig(motion),
+        simulation=coarse if full.garment == "shirt" else replace(coarse, **_AT_WAIST),
+        relaxation=tiny.relaxation,
+        scanner=replace(
+            tiny.scanner,
+            rig=RigConfig(cameras=32, image_size=400 if full.garment == "shirt" else 600),
+            fusion=replace(tiny.scanner.fusion, body_voxel_m=0.007, min_component_faces=60),
+        ),
+    )
+
+
+PRESETS |= {
+    "shirt-200k": _SHIRT,
+    "trousers-200k": _TROUSERS,
+    "skirt-200k": _SKIRT,
+    "shirt-demo": _small(_SHIRT, "shirt-demo", "reach"),
+    "trousers-demo": _small(_TROUSERS, "trousers-demo", "squat"),
+    "skirt-demo": _small(_SKIRT, "skirt-demo", "lunge"),
+}
 
 
 @settings

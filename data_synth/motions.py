@@ -30,9 +30,18 @@ Keyframe = tuple[float, dict[str, float]]
 """Time in seconds, and controls in degrees, or in centimetres where their names say so; a control that is not named
 keeps its last value, 0 at the start."""
 
+PLANTED = "ankle_left"
+"""A clip that moves the ankles keeps its feet on the floor: knees bend, and the person sinks."""
 HANGING, OVERHEAD = -25.0, 116.0
 """Lateral arm raise from the rest pose, whose arms point about 49 degrees below the horizontal. Hanging arms keep 16
 degrees from the vertical, as subjects are asked to: 3 degrees less, and the sides of a shirt are out of sight."""
+
+
+def _mirrored(controls: dict[str, float]) -> dict[str, float]:
+    """The same with left and right exchanged, of limbs alone."""
+    swap = {"left": "right", "right": "left"}
+    parts = {name: name.split("_") for name in controls}
+    return {"_".join(swap.get(part, part) for part in parts[name]): value for name, value in controls.items()}
 
 
 def _walk(steps: int) -> list[Keyframe]:
@@ -47,6 +56,50 @@ def _walk(steps: int) -> list[Keyframe]:
         frames.append((0.5 * step + 0.5, {**swing, **arms, "lift_cm": -2.0, "travel_cm": away}))
     return frames
 
+
+_STANDING = {
+    "raise_both": 12.0, "spread_both": 5.0, "tilt": 0.0, "bend": 0.0, "leg_both": 0.0, "knee_both": 0.0,
+    "ankle_both": 0.0, "forward_both": 0.0,
+}  # fmt: skip
+_SQUATTING = {
+    "tilt": 26.0, "bend": 16.0, "leg_both": 88.0, "knee_both": 88.0, "ankle_both": 26.0, "spread_both": 14.0,
+    "forward_both": 70.0,
+}  # fmt: skip
+_LUNGING = {
+    "leg_left": 62.0, "knee_left": 68.0, "ankle_left": 6.0, "leg_right": -8.0, "knee_right": 62.0, "ankle_right": 25.0,
+    "raise_both": 18.0, "bend": 6.0,
+}  # fmt: skip
+_SQUAT: list[Keyframe] = [(0.0, _STANDING), (1.0, _SQUATTING), (1.2, {}), (2.2, _STANDING)]
+_LUNGE: list[Keyframe] = [
+    (0.0, _STANDING),
+    (0.9, _LUNGING),
+    (1.7, _STANDING),
+    (2.6, _mirrored(_LUNGING)),
+    (3.4, _STANDING),
+]
+_SIT: list[Keyframe] = [
+    (0.0, _STANDING),
+    (0.7, {"tilt": 24.0, "bend": 14.0, "leg_both": 66.0, "knee_both": 62.0, "ankle_both": 20.0, "forward_both": 30.0}),
+    (1.3, {"tilt": 2.0, "bend": 2.0, "leg_both": 86.0, "knee_both": 84.0, "ankle_both": 0.0, "forward_both": 20.0}),
+    (1.6, {}),
+    (2.1, {"tilt": 24.0, "bend": 14.0, "leg_both": 66.0, "knee_both": 62.0, "ankle_both": 20.0, "forward_both": 30.0}),
+    (2.8, _STANDING),
+]
+_REACH_DOWN: list[Keyframe] = [
+    (0.0, _STANDING),
+    (1.1, {"tilt": 62.0, "bend": 46.0, "leg_both": 84.0, "knee_both": 36.0, "ankle_both": 14.0, "forward_both": 82.0}),
+    (1.3, {}),
+    (2.3, _STANDING),
+]
+_RANGE_OF_LEGS: list[Keyframe] = [
+    (0.0, _STANDING),
+    (0.6, {"leg_left": 48.0, "knee_left": 62.0, "raise_both": 20.0}),
+    (1.1, _mirrored(_LUNGING)),
+    (1.6, {**_STANDING, "side": 10.0}),
+    (2.3, {**_SQUATTING, "side": 0.0}),
+    (2.45, {}),
+    (3.1, _STANDING),
+]
 
 CLIPS: dict[str, list[Keyframe]] = {
     "range-of-motion": [
@@ -80,6 +133,11 @@ CLIPS: dict[str, list[Keyframe]] = {
         (3.0, {"raise_both": -28, "bend": 0}),
     ],
     "walk": _walk(6),
+    "lunge": _LUNGE,
+    "squat": _SQUAT,
+    "sit": _SIT,
+    "reach-down": _REACH_DOWN,
+    "range-of-legs": _RANGE_OF_LEGS,
     "hop": [
         (0.0, {"raise_both": -22}),
         (0.4, {"leg_both": 28, "knee_both": 56, "lift_cm": -10, "bend": 14, "forward_both": -20}),
@@ -175,7 +233,21 @@ def scripted_clip(
         values[name] = amplitude * PchipInterpolator(times, levels)(at)
     still = np.zeros(frames)
     path = np.stack([still, values.get("lift_cm", still), values.get("travel_cm", still)], axis=1) / 100
-    return pose_sequence(shaped, _control_rotations(shaped, values, frames), fps, path)
+    rotations = _control_rotations(shaped, values, frames)
+    if PLANTED in values:
+        path = path + _planted(shaped, rotations)
+    return pose_sequence(shaped, rotations, fps, path)
+
+
+def _planted(shaped: ShapedBody, rotations: np.ndarray) -> np.ndarray:
+    """Where the root goes, (T, 3) metres, that keeps the lowest point on the floor and the feet in place."""
+    feet = [shaped.body.joint_names.index(f"foot.{side}") for side in "LR"]
+    path = np.zeros((len(rotations), 3))
+    for frame, pose in enumerate(rotations):
+        body = with_pose(shaped, pose, np.zeros(3))
+        path[frame] = -body.joint_centres()[feet].mean(axis=0)
+        path[frame, 1] = -body.vertices()[:, 1].min()
+    return path - path[0]
 
 
 def _both_sides(controls: dict[str, float]) -> dict[str, float]:
@@ -208,6 +280,12 @@ def _control_rotations(shaped: ShapedBody, values: dict[str, np.ndarray], frames
         turn(f"lowerarm01.{side}", "y", -sign * elbow)
         turn(f"upperleg01.{side}", "x", -control(f"leg_{word}"))
         turn(f"lowerleg01.{side}", "x", control(f"knee_{word}"))
+        if f"spread_{word}" in values:
+            turn(f"upperleg01.{side}", "z", sign * control(f"spread_{word}"))
+        if f"ankle_{word}" in values:
+            turn(f"foot.{side}", "x", -control(f"ankle_{word}"))
+    if "tilt" in values:
+        turn("root", "x", control("tilt"))
     for joint in ("spine04", "spine03", "spine02"):
         turn(joint, "y", control("twist") / 3)
         turn(joint, "x", control("bend") / 3)

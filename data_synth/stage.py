@@ -27,7 +27,8 @@ from data_synth.outfits import OUTFITS
 from data_synth.prints import picture_over
 from data_synth.scan_files import pending_scans
 from data_synth.scanner.scan import scan_surfaces
-from data_synth.take import TakePlan, measured_poses, plan_take, simulate_take, take_rig, take_surfaces
+from data_synth.take import TakePlan, in_view, measured_poses, plan_take, simulate_take, take_rig, take_surfaces
+from data_synth.worn import template_weights
 
 __all__ = [
     "ScanJob",
@@ -188,7 +189,7 @@ def simulate_clip(job: SimulationJob) -> None:
         quality = measure_cloth(take.fine, take.wrinkles, fine, surface, faces)
         write_json(folder / "cloth" / f"{frame_id:06d}.json", asdict(quality))
         write_npz(folder / "cloth" / f"{frame_id:06d}.npz", vertices=fine, body=surface.astype(np.float32))
-        extent.append((fine.min(axis=0), fine.max(axis=0)))
+        extent.append(in_view(config, fine, surface))
     rig = take_rig(config, np.array(extent))
     save_rig(folder / "rig.json", rig)
     outfit = OUTFITS[config.outfit]
@@ -215,7 +216,10 @@ def _write_model(take: TakePlan, folder: Path, dressed: np.ndarray, coarse: np.n
     """The template, and the truth that no frame changes."""
     body_at = take.config.simulation.calm_frames - 1
     settled = carry(take.coarse, take.template, coarse)
-    garment = bind_template(take.template, dressed, take.bodies[body_at], settled, take.bodies[take.lead])
+    weights = template_weights(take.config, dressed, take.bodies[body_at])
+    garment = bind_template(
+        take.template, dressed, take.bodies[body_at], settled, take.bodies[take.lead], skin_weights=weights
+    )
     save_garment(folder / "template.npz", garment)
     faces, weights = locate(take.fine, take.template.vertex_uv)
     write_truth_model(

@@ -18,9 +18,8 @@ from capture4d.motions.retargeting import pose_sequence
 from capture4d.types import Mesh, PoseSequence, Rig
 from data_synth.cloth.panels import Pattern
 from data_synth.cloth.patterns import PanelMesh, grade, mesh_pattern
-from data_synth.cloth.simulation import approach_poses, dress, simulate
+from data_synth.cloth.simulation import approach_poses, simulate
 from data_synth.cloth.tailoring import Made, tailor
-from data_synth.cloth.tshirt import tshirt_pattern
 from data_synth.cloth.wrinkle_relaxation import Finish, Level, WrinkleMesh, relax_levels, wrinkle_mesh
 from data_synth.config import FABRICS, SynthConfig
 from data_synth.motions import make_motion
@@ -29,11 +28,13 @@ from data_synth.prints import printed_cloth
 from data_synth.scanner.raycast import Print
 from data_synth.scanner.rig import bounding_sphere, scanner_rig
 from data_synth.scanner.scan import LABEL_BODY, LABEL_GARMENT, Surface
+from data_synth.worn import draft, dressing_pose, is_held_at_waist, put_on
 
 __all__ = [
     "Paint",
     "TakePlan",
     "dress_colours",
+    "in_view",
     "measured_poses",
     "painted_band",
     "plan_take",
@@ -49,8 +50,14 @@ PRINT_STREAM = 300
 """Added to the seed of a take for that of its print."""
 BORDER_BAND_M = 0.009
 """Width of the painted border."""
+WIDE_BAND_M = 0.015
+"""The same of trousers and skirts: the rig stands farther away, and loses more of what is at an edge."""
 RIG_RADIUS_M = 0.58
 """Smallest sphere the rig is set up for: the upper body with room for the garment."""
+
+
+IN_VIEW_STRIDE = 16
+"""Every so many vertices of the body tell how large it is."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,7 +127,7 @@ def plan_take(config: SynthConfig) -> TakePlan:
         motion.joint_names,
     )
     clip = [pose_frame(shaped, motion, index) for index in range(simulated)]
-    pattern = tshirt_pattern(shaped, config.style)
+    pattern = draft(config, shaped)
     counts = {
         "coarse": config.simulation.vertices,
         "fine": config.relaxation.vertices,
@@ -129,7 +136,7 @@ def plan_take(config: SynthConfig) -> TakePlan:
     if config.folds is not None:
         counts["wide"] = config.folds.wide.vertices
         streams["wide"] = np.random.default_rng([config.seed, WIDE_STREAM])
-    first = tshirt_pattern(drafted, config.style)
+    first = draft(config, drafted)
     meshes = {name: mesh_pattern(first, count, streams[name]) for name, count in counts.items()}
     if config.drafted_for is not None:
         meshes = {name: grade(mesh, first, pattern) for name, mesh in meshes.items()}
@@ -138,7 +145,7 @@ def plan_take(config: SynthConfig) -> TakePlan:
         config=config,
         shaped=shaped,
         poses=poses,
-        bodies=approach_poses(shaped, motion, config.simulation) + clip,
+        bodies=approach_poses(shaped, motion, config.simulation, dressing_pose(config, shaped)) + clip,
         pattern=pattern,
         coarse=meshes["coarse"],
         fine=meshes["fine"],
@@ -170,7 +177,8 @@ def _folded(
 
 
 def _paint(config: SynthConfig, fine: PanelMesh, shaped: ShapedBody) -> Paint:
-    outfit, is_border = OUTFITS[config.outfit], painted_band(fine)
+    outfit = OUTFITS[config.outfit]
+    is_border = painted_band(fine, WIDE_BAND_M if is_held_at_waist(config) else BORDER_BAND_M)
     cloth = outfit.garment if config.print is None else WHITE
     garment = np.where(is_border[:, None], outfit.border, cloth).astype(np.uint8)
     return Paint(garment, is_border, dress_colours(shaped, outfit), _print(config, outfit, fine, is_border))
@@ -196,7 +204,7 @@ def simulate_take(take: TakePlan) -> Iterator[tuple[int, np.ndarray, np.ndarray 
         frames the fine cloth (V, 3), else None.
     """
     fabric, lead, offsets = FABRICS[take.config.fabric], take.lead, None
-    start = dress(take.shaped, take.coarse, take.pattern, take.bodies[0])
+    worn = put_on(take.config, take.shaped, take.coarse, take.pattern, take.bodies[0])
 
     def relax(coarse: np.ndarray, body: PosedBody) -> np.ndarray:
         nonlocal offsets
@@ -205,7 +213,15 @@ def simulate_take(take: TakePlan) -> Iterator[tuple[int, np.ndarray, np.ndarray 
 
     with ThreadPoolExecutor(1) as second_core:  # newton and numba both release the interpreter
         waiting = []
-        sheet = simulate(take.coarse, start, take.bodies, fabric, take.config.simulation, made=take.made)
+        sheet = simulate(
+            take.coarse,
+            worn.vertices,
+            take.bodies,
+            fabric,
+            take.config.simulation,
+            made=take.made,
+            held_from=worn.held_from,
+        )
         for step, coarse in enumerate(sheet):
             index = step - lead
             captured = index >= 0 and index % take.config.capture_every == 0
@@ -235,11 +251,11 @@ def measured_poses(take: TakePlan) -> PoseSequence:
     )
 
 
-def painted_band(mesh: PanelMesh) -> np.ndarray:
+def painted_band(mesh: PanelMesh, width_m: float = BORDER_BAND_M) -> np.ndarray:
     """The vertices, (V,) bool, in the painted band along every border of the pattern."""
     border = np.concatenate(list(mesh.loops.values()))
     corners = np.isin(mesh.faces, border)
-    return KDTree(mesh.uv[corners]).query(mesh.vertex_uv, distance_upper_bound=BORDER_BAND_M)[0] < BORDER_BAND_M
+    return KDTree(mesh.uv[corners]).query(mesh.vertex_uv, distance_upper_bound=width_m)[0] < width_m
 
 
 def dress_colours(shaped: ShapedBody, outfit: Outfit) -> np.ndarray:
@@ -249,8 +265,18 @@ def dress_colours(shaped: ShapedBody, outfit: Outfit) -> np.ndarray:
     return np.where(bare[:, None], outfit.skin, outfit.suit).astype(np.uint8)
 
 
+def in_view(config: SynthConfig, fine: np.ndarray, surface: np.ndarray) -> np.ndarray:
+    """Points, (N, 3), that the rig is set up around in a frame: the corners of the garment's box.
+
+    Of legs that trousers or a skirt hide the rest of the person tells most, so there it is the whole person.
+    """
+    if is_held_at_waist(config):
+        return surface[::IN_VIEW_STRIDE]
+    return np.array([fine.min(axis=0), fine.max(axis=0)])
+
+
 def take_rig(config: SynthConfig, extent: np.ndarray) -> Rig:
-    """The rig around a garment whose corners, (..., 3) metres, lie within `extent` all through the clip."""
+    """The rig around points, (..., 3) metres, that have to be in view all through the clip (`in_view`)."""
     centre, radius = bounding_sphere(extent)
     return scanner_rig(config.scanner, centre=centre, radius=max(radius, RIG_RADIUS_M))
 

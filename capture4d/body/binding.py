@@ -7,10 +7,12 @@ that was made on one person is moved to another by how the body points under it 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Float32, Int32
+from jaxtyping import Bool, Float, Float32, Int32
 from scipy.sparse import csr_array
+from scipy.spatial import KDTree
 
 from capture4d.body.skinning import PosedBody, with_shape
 from capture4d.errors import InputError
@@ -18,28 +20,78 @@ from capture4d.geometry.mesh import vertex_adjacency
 from capture4d.geometry.ray_casting import TriangleScene, barycentric
 from capture4d.types import Body, Garment
 
-__all__ = ["WEIGHT_SMOOTHING", "bind", "diffuse", "embedded_offset", "with_body_shape"]
+__all__ = [
+    "WEIGHT_SMOOTHING",
+    "bind",
+    "diffuse",
+    "embedded_offset",
+    "loose_weights",
+    "weights_around",
+    "with_body_shape",
+]
 
 WEIGHT_SMOOTHING = 12
 """Diffusion steps on the skin weights: nearest body points jump from trunk to arm under a sleeve."""
+LOOSE_NEIGHBOURS = 100
+"""Body vertices that a vertex of loose cloth follows (TailorNet, section 4.1)."""
 OFFSET_SMOOTHING = 12
 """The same on the way to another shape, for the same reason."""
 
 
 def bind(
-    vertices: Float[np.ndarray, "verts 3"], faces: Int32[np.ndarray, "faces 3"], body: PosedBody
+    vertices: Float[np.ndarray, "verts 3"],
+    faces: Int32[np.ndarray, "faces 3"],
+    body: PosedBody,
+    *,
+    smoothing: int = WEIGHT_SMOOTHING,
 ) -> tuple[Int32[np.ndarray, " verts"], Float32[np.ndarray, "verts 3"], Float[np.ndarray, "verts joints"]]:
     """The nearest body point of each vertex, as face and barycentric coordinates, and smooth skin weights.
 
     Args:
         vertices: on the body, best in a pose where the limbs are well apart.
+        smoothing: diffusion steps on the weights; 0 moves each vertex exactly as the skin beneath it.
     """
     body_faces = body.shaped.body.template.faces
     nearest = TriangleScene((body.vertices(), body_faces)).nearest(vertices)
     within = barycentric(nearest.uv)
     weights = np.einsum("vk,vkj->vj", within, body.shaped.body.skin_weights[body_faces[nearest.faces]])
-    weights = diffuse(weights, faces, WEIGHT_SMOOTHING)
+    weights = diffuse(weights, faces, smoothing)
     return nearest.faces, within, weights / weights.sum(axis=1, keepdims=True)
+
+
+def loose_weights(
+    points: Float[np.ndarray, "verts 3"],
+    body: PosedBody,
+    *,
+    near: Bool[np.ndarray, " skin"] | None = None,
+    follow: Literal["distance", "root"] = "distance",
+) -> Float[np.ndarray, "verts joints"]:
+    """Skin weights of cloth that hangs free of the limbs, such as a skirt, whose nearest body point jumps between them.
+
+    Args:
+        points: the cloth on the body, metres.
+        near: the body's vertices that it may follow; all if None.
+        follow: the mean of the skin around, weighted by inverse distance, or the root joint alone.
+    References: Patel et al., TailorNet (CVPR 2020), section 4.1.
+    """
+    skin_weights = body.shaped.body.skin_weights
+    if follow == "root":
+        weights = np.zeros((len(points), skin_weights.shape[1]))
+        weights[:, 0] = 1.0
+        return weights
+    chosen = np.arange(len(skin_weights)) if near is None else np.flatnonzero(near)
+    weights = weights_around(points, body.vertices()[chosen], skin_weights[chosen])
+    return weights / weights.sum(axis=1, keepdims=True)
+
+
+def weights_around(
+    points: Float[np.ndarray, "verts 3"],
+    skin: Float[np.ndarray, "skin 3"],
+    skin_weights: Float[np.ndarray, "skin joints"],
+) -> Float[np.ndarray, "verts joints"]:
+    """Sums of the skin weights around points, by inverse distance; not yet divided by their own sums."""
+    distance, nearest = map(np.asarray, KDTree(skin).query(points, k=min(LOOSE_NEIGHBOURS, len(skin))))
+    return np.einsum("vk,vkj->vj", 1 / np.maximum(distance, 1e-4), skin_weights[nearest])
 
 
 def diffuse(

@@ -39,6 +39,7 @@ EXAMPLES: Mapping[str, Sequence[str]] = {
         "synth take --preset tiny",
         "synth take --frames 60 --outfit red --scanner stereo",
         "synth take --print stripes",
+        "synth take --preset trousers-200k --cut length=0.5 --motion.clip squat",
     ),
     "scan": ("scan meshes take --fps 30 --template template.obj",),
     "synth-board": ("synth-board capture/rig.json board --poses 16",),

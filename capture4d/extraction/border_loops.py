@@ -1,4 +1,7 @@
-"""Border points as curves: noise across them removed, loops told apart, ordered along, and a shirt's loops named."""
+"""Border points as curves: noise across them removed, loops told apart, ordered along, and named by their shape.
+
+Known are shirts (neck, hem, two cuffs), trousers (waist, two legs) and skirts (waist, hem).
+"""
 
 from __future__ import annotations
 
@@ -9,9 +12,11 @@ from jaxtyping import Bool, Float, Float64, Int32, Int64
 from scipy import sparse
 from scipy.spatial import KDTree
 
-__all__ = ["SHIRT", "loop_order", "name_shirt_loops", "separate_loops", "straighten"]
+__all__ = ["SHIRT", "SKIRT", "TROUSERS", "loop_order", "name_loops", "separate_loops", "straighten"]
 
 SHIRT = ("neck", "hem", "cuff_left", "cuff_right")
+TROUSERS = ("waist", "leg_left", "leg_right")
+SKIRT = ("waist", "hem")
 GAPS_M = (0.012, 0.02, 0.03, 0.045, 0.06)
 """Gaps in a border that are bridged, tried in turn."""
 MIN_EXTENT_M = 0.08
@@ -20,6 +25,17 @@ MAX_STRAYS = 0.1
 """Share of the points beside the loops above which the loops are pieces of loops."""
 MAX_GAP_DEG = 100.0
 """Largest opening of a loop, seen from its middle; half a circle has 115."""
+WAIST_OVER_LEG = 1.25
+"""Least ratio of a waist's length to that of the longer leg of trousers, by which it is known."""
+SEAT_BAND_M = (0.08, 0.24)
+"""Where the seat of trousers is, below the waist."""
+MIN_SEAT_M = 0.012
+"""By how much the seat has to stand out farther than the belly to tell front from back."""
+STANDING = 0.5
+"""Trousers that reach farther to front and back, as a share of their height, are those of bent legs: they tell neither
+front nor back."""
+MIN_DROP_M = 0.1
+"""A skirt's hem is at least so far below its waist."""
 MIN_TILT = 0.15
 """Sine of the slope of a neckline from back to front below which it does not tell front from back."""
 
@@ -87,34 +103,90 @@ def _length(points: np.ndarray) -> float:
     return float(np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).sum())
 
 
-def name_shirt_loops(points: Float[np.ndarray, "points 3"], names: Sequence[str]) -> Int32[np.ndarray, " points"]:
+def name_loops(
+    points: Float[np.ndarray, "points 3"],
+    names: Sequence[str],
+    surface: Float[np.ndarray, "verts 3"] | None = None,
+) -> Int32[np.ndarray, " points"]:
     """The index in `names` of the loop that each point is on, -1 where its shape does not tell.
 
-    All four loops have to be there nearly whole: where arms hide pieces of them, what is left has other shapes. The hem
-    is the longest loop; of the other three the two farthest apart are the cuffs. The neckline is lower in front, which
-    tells left from right.
+    All loops have to be there nearly whole: where arms hide pieces of them, what is left has other shapes.
+
+    Args:
+        points: border points of one garment, Y up.
+        surface: vertices of its scan, by whose seat the legs of trousers are told; without them they are not.
     """
     unknown = np.full(len(points), -1, np.int32)
-    if sorted(names) != sorted(SHIRT) or not len(points):
+    kind = next((kind for kind in (SHIRT, TROUSERS, SKIRT) if sorted(kind) == sorted(names)), None)
+    if kind is None or not len(points):
         return unknown
-    loop = separate_loops(points, len(SHIRT))
-    members: list[Bool[np.ndarray, " points"]] = [loop == index for index in range(len(SHIRT))]
+    loop = separate_loops(points, len(kind))
+    members: list[Bool[np.ndarray, " points"]] = [loop == index for index in range(len(kind))]
     if (loop < 0).mean() > MAX_STRAYS or max(_opening_deg(points[own]) for own in members) > MAX_GAP_DEG:
         return unknown
-    middles = [points[own].mean(axis=0) for own in members]
+    loops = [points[own] for own in members]
+    if kind == SHIRT:
+        found = _shirt_names(loops)
+    elif kind == TROUSERS:
+        found = _trousers_names(loops, surface)
+    else:
+        found = _skirt_names(loops)
+    for own, name in zip(members, found, strict=True):
+        if name is not None:
+            unknown[own] = names.index(name)
+    return unknown
+
+
+def _shirt_names(loops: Sequence[np.ndarray]) -> list[str | None]:
+    """Of four loops, the longest first: that is the hem, the two of the others farthest apart are the cuffs. The
+    neckline is lower in front, which tells left from right."""
+    middles = [loop.mean(axis=0) for loop in loops]
     pairs = [(1, 2, 3), (1, 3, 2), (2, 3, 1)]
     one, other, neck = max(pairs, key=lambda pair: float(np.linalg.norm(middles[pair[0]] - middles[pair[1]])))
-    named = unknown.copy()
-    named[members[0]], named[members[neck]] = names.index("hem"), names.index("neck")
+    found: list[str | None] = ["hem", None, None, None]
+    found[neck] = "neck"
     upward = middles[neck] - middles[0]
     upward /= np.linalg.norm(upward)
     across = middles[one] - middles[other]
     forward = np.cross(across, upward)  # if `one` is the left cuff
     forward /= np.linalg.norm(forward)
-    neckline = points[members[neck]] - middles[neck]
+    neckline = loops[neck] - middles[neck]
     depth = neckline @ forward
     slope = float((depth @ (neckline @ upward)) / (depth @ depth))
     if abs(slope) > MIN_TILT:
         left, right = (one, other) if slope < 0 else (other, one)
-        named[members[left]], named[members[right]] = names.index("cuff_left"), names.index("cuff_right")
-    return named
+        found[left], found[right] = "cuff_left", "cuff_right"
+    return found
+
+
+def _trousers_names(loops: Sequence[np.ndarray], surface: np.ndarray | None) -> list[str | None]:
+    """Of three loops, the longest first: that is the waist, if it is longer by far. The seat stands out behind, which
+    tells left from right while the legs are straight."""
+    if _length(loops[0]) < WAIST_OVER_LEG * _length(loops[1]):
+        return [None, None, None]
+    found: list[str | None] = ["waist", None, None]
+    if surface is None:
+        return found
+    waist, one, other = (loop.mean(axis=0) for loop in loops)
+    upward = waist - (one + other) / 2
+    height = float(np.linalg.norm(upward))
+    upward /= height
+    across = one - other
+    forward = np.cross(across - (across @ upward) * upward, upward)  # if `one` is the left leg
+    forward /= np.linalg.norm(forward)
+    depth, below = (surface - waist) @ forward, (waist - surface) @ upward
+    seat = depth[(below > SEAT_BAND_M[0]) & (below < SEAT_BAND_M[1])]
+    if np.ptp(depth) > STANDING * height or not len(seat):
+        return found
+    front, back = np.percentile(seat, 99), -np.percentile(seat, 1)
+    if abs(back - front) > MIN_SEAT_M:
+        found[1:] = ("leg_left", "leg_right") if back > front else ("leg_right", "leg_left")
+    return found
+
+
+def _skirt_names(loops: Sequence[np.ndarray]) -> list[str | None]:
+    """Of two loops the lower is the hem: a skirt hangs, whatever the pose."""
+    heights = [float(loop[:, 1].mean()) for loop in loops]
+    if abs(heights[0] - heights[1]) < MIN_DROP_M:
+        return [None, None]
+    return ["waist", "hem"] if heights[0] > heights[1] else ["hem", "waist"]

@@ -27,7 +27,7 @@ from capture4d.colours.printed_cloth import label_print
 from capture4d.colours.spaces import Colour, format_colour
 from capture4d.errors import InputError
 from capture4d.extraction.band_borders import border_beyond_rim
-from capture4d.extraction.border_loops import loop_order, name_shirt_loops, straighten
+from capture4d.extraction.border_loops import loop_order, name_loops, straighten
 from capture4d.extraction.label_edges import sharpen_labels
 from capture4d.geometry.mesh_kernels import face_components, open_vertices
 from capture4d.types import GarmentScan, Mesh, Scan
@@ -302,7 +302,7 @@ def cut_out(
         unknown = np.full(len(garment.boundary_points), -1, np.int32)
         garment = replace(garment, boundary_loops=unknown, loop_names=colours.loop_names)
     if (garment.boundary_loops < 0).all():
-        named = name_shirt_loops(garment.boundary_points, garment.loop_names)
+        named = name_loops(garment.boundary_points, garment.loop_names, garment.mesh.vertices)
         garment = replace(garment, boundary_loops=named)
     return _in_order(garment)
 

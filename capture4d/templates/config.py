@@ -7,10 +7,11 @@ from typing import Literal
 from capture4d.settings import Whole, settings
 from capture4d.units import Units
 
-__all__ = ["TEMPLATE", "Axis", "MeshUnits", "Region", "TemplateConfig", "UvChoice"]
+__all__ = ["TEMPLATE", "Axis", "Follow", "MeshUnits", "Region", "TemplateConfig", "UvChoice"]
 
 Region = Literal["tshirt", "longsleeve", "trousers", "shorts"]
 UvChoice = Literal["auto", "keep", "fresh", "none"]
+Follow = Literal["skin", "distance", "root"]
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 MeshUnits = Literal["auto", Units]
 
@@ -35,6 +36,9 @@ class TemplateConfig:
     """The mesh's UVs are its sewing pattern, whatever they look like."""
     wrap: bool = False
     """Bind the mesh to where it comes to lie when it is shrunk onto the body, instead of to its nearest body points."""
+    follow: Follow = "skin"
+    """What moves the garment: the skin beneath each point; of one that hangs loose, such as a skirt, the mean of the
+    trunk and legs around it, weighted by inverse distance; or the root joint alone."""
 
 
 TEMPLATE = TemplateConfig()

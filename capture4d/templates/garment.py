@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float32, Float64, Int32
 
-from capture4d.body.binding import WEIGHT_SMOOTHING, diffuse
+from capture4d.body.binding import WEIGHT_SMOOTHING, diffuse, loose_weights
 from capture4d.body.posed_surface import Matches, PosedSurface, match, tracked_body
 from capture4d.body.sewing_pattern import PatternFit, as_pattern, fit_pattern
 from capture4d.body.skinning import PosedBody, unskin
@@ -24,7 +24,7 @@ from capture4d.geometry.cages.dirichlet import flattened
 from capture4d.geometry.mesh import boundary_loops, edge_uses, half_edges, vertex_normals
 from capture4d.geometry.seams import welded_mesh
 from capture4d.geometry.uv_atlas import UvReport, check_uv, fresh_uv
-from capture4d.templates.config import UvChoice
+from capture4d.templates.config import Follow, UvChoice
 from capture4d.templates.wrapping import CageMarks, Wrap, found_cage, wrap_garment
 from capture4d.types import Body, Garment, Mesh
 
@@ -37,6 +37,8 @@ LEAST_SIZE_M = 0.05
 NORMAL_WEIGHT = 4.0
 """How much more facing counts than in tracking: loose cloth hangs centimetres away from its limb."""
 ARM = r"upperarm|lowerarm|wrist|elbow|_shoulder|_hand"
+ARM_SHARE = 0.3
+"""Skin that arms move by more than this is no skin of trunk or legs."""
 LEG = r"upperleg|lowerleg|foot|knee|ankle|_hip"
 NECK = r"neck|head"
 
@@ -64,6 +66,7 @@ def make_template(
     *,
     uv: UvChoice = "auto",
     uv_is_pattern: bool = False,
+    follow: Follow = "skin",
     names: Sequence[str] = (),
     wrap: bool = False,
     cage: CageMarks | None = None,
@@ -76,6 +79,7 @@ def make_template(
             belong to face corners, stay.
         uv: keep the mesh's, cut `fresh` ones, have `none`; `auto` keeps them if nothing is wrong with them.
         uv_is_pattern: the UVs are the sewing pattern, whatever they look like; else they are compared with one.
+        follow: what moves it, as `TemplateConfig.follow` says.
         names: of the loops, the one with the most vertices first; found by position if empty.
         wrap: bind each vertex to where it comes to lie when the mesh is shrunk onto the body, not to its nearest point.
         cage: along which it is shrunk, marked on the mesh as it came; found if None.
@@ -110,6 +114,9 @@ def make_template(
         wrapped = wrap_garment(mesh, binding.surface, binding.normals, binding.nearest.points, cage=marked, flat=flat)
         binding = binding.moved_to(mesh, wrapped.placed.faces, wrapped.placed.barycentric)
     weights = binding.weights
+    if follow != "skin":
+        arms = _share_of(body.shaped.body, ARM)
+        weights = loose_weights(mesh.vertices, body, near=arms < ARM_SHARE, follow=follow).astype(np.float32)
     rest, flagged = unskin(mesh.vertices, weights, body.transforms)
     if flagged.any():
         raise InputError(
@@ -246,10 +253,11 @@ def name_loops(
     rest: Float64[np.ndarray, "verts 3"],
     body: Body,
 ) -> tuple[str, ...]:
-    """neck, hem, cuff_left and cuff_right of a shirt; waist, leg_left and leg_right of trousers.
+    """neck, hem, cuff_left and cuff_right of a shirt; waist, leg_left and leg_right of trousers; waist, hem of a skirt.
 
     A loop goes around what moves it most. What is on the trunk is the hem at the bottom, the neck on top; of a garment
-    with legs it is the waist. Several of one kind are counted.
+    with legs it is the waist, as is the top of one that ends nearer to the hips than to the neck. Several of one kind
+    are counted.
     """
     kinds = []
     for loop in loops:
@@ -271,7 +279,7 @@ def name_loops(
         elif part == "leg":
             names.append(f"leg_{side}")
         elif part == "neck" or index == highest:
-            names.append("neck")
+            names.append("waist" if part != "neck" and _is_at_hips(rest[loops[index]], body) else "neck")
         else:
             names.append("waist" if has_legs else "hem")
     seen: Counter[str] = Counter()
@@ -282,6 +290,20 @@ def name_loops(
     return tuple(counted)
 
 
+def _is_at_hips(loop: np.ndarray, body: Body) -> bool:
+    """Whether a loop around the trunk, (N, 3) at rest, is nearer to the hips than to the neck."""
+    hips, neck = (body.joints[_named(body, pattern), 1] for pattern in (LEG, NECK))
+    return len(hips) > 0 and len(neck) > 0 and float(loop[:, 1].mean()) < float(hips.max() + neck.min()) / 2
+
+
 def _share(weights: np.ndarray, body: Body, pattern: str) -> float:
-    named = [bool(re.search(pattern, name)) for name in body.joint_names]
-    return float(weights[named].sum())
+    return float(weights[_named(body, pattern)].sum())
+
+
+def _share_of(body: Body, pattern: str) -> np.ndarray:
+    """Of each vertex of the body, (B,), what moves it that is named so."""
+    return body.skin_weights[:, _named(body, pattern)].sum(axis=1)
+
+
+def _named(body: Body, pattern: str) -> list[bool]:
+    return [bool(re.search(pattern, name)) for name in body.joint_names]

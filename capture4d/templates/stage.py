@@ -83,6 +83,7 @@ def run(
         posed,
         uv=config.uv,
         uv_is_pattern=config.uv_is_pattern,
+        follow=config.follow,
         names=config.loop_names,
         wrap=config.wrap,
         cage=marks,

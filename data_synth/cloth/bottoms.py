@@ -70,14 +70,14 @@ def trousers_pattern(
             line(crotch_in, hem_in),
         )
         panels += [_leg_panel(name, side, sides) for side in ("left", "right")]
-    return Pattern(lay_out(tuple(panels)), borders=("waist", "cuff_left", "cuff_right"))
+    return Pattern(lay_out(tuple(panels)), borders=("waist", "leg_left", "leg_right"))
 
 
 def _leg_panel(name: str, side: str, sides: tuple[np.ndarray, ...]) -> Panel:
     """A leg's front or back as seen from outside, where the front of the left leg has its outseam on the +u side."""
-    cuff, outseam, waist, centre, inseam = sides
+    hem, outseam, waist, centre, inseam = sides
     edges = (
-        Edge(cuff, f"cuff_{side}|{name}"),
+        Edge(hem, f"leg_{side}|{name}"),
         Edge(outseam, f"out_{side}"),
         Edge(waist, f"waist|{name}_{side}"),
         Edge(centre, f"centre_{name}"),

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation, Slerp
 
-from capture4d.body.binding import bind
+from capture4d.body.binding import WEIGHT_SMOOTHING, bind
 from capture4d.body.skinning import PosedBody, ShapedBody, skin, unskin, with_pose
 from capture4d.geometry.mesh import unique_edges, vertex_adjacency, vertex_normals
 from capture4d.geometry.ray_casting import TriangleScene
@@ -29,7 +29,7 @@ from data_synth.cloth.patterns import PanelMesh, smooth_noise
 from data_synth.cloth.tailoring import Made, Sleeve, Wall, bending_factors, wall_heights, walls
 from data_synth.config import Fabric, SimulationConfig
 
-__all__ = ["approach_poses", "dress", "dressing_rotations", "simulate"]
+__all__ = ["approach_poses", "clear_of_body", "dress", "dressing_rotations", "simulate"]
 
 DRESSING_ARM_RAISE_DEG = 42.0
 """Raises the arms of the rest pose to about the horizontal, so that a flat T fits over them."""
@@ -54,9 +54,16 @@ def dressing_rotations(shaped: ShapedBody) -> np.ndarray:
     return rotations
 
 
-def approach_poses(shaped: ShapedBody, poses: PoseSequence, config: SimulationConfig) -> list[PosedBody]:
-    """The way into a clip: calm frames in the dressing pose, a motion to its first pose, and a rest there."""
-    start, end = dressing_rotations(shaped), poses.rotations[0].astype(np.float64)
+def approach_poses(
+    shaped: ShapedBody, poses: PoseSequence, config: SimulationConfig, rotations: np.ndarray | None = None
+) -> list[PosedBody]:
+    """The way into a clip: calm frames in the dressing pose, a motion to its first pose, and a rest there.
+
+    Args:
+        rotations: joints of the dressing pose, (J, 3, 3), as for `dress`.
+    """
+    start = dressing_rotations(shaped) if rotations is None else rotations.copy()
+    end = poses.rotations[0].astype(np.float64)
     start[0] = end[0]
     ramp = np.linspace(0, 1, config.approach_frames)
     ramp = ramp * ramp * (3 - 2 * ramp)
@@ -113,12 +120,18 @@ def dress(
         rows = panel == f"sleeve_{side}"
         arm = surface[(sign * surface[:, 0] > half) & (sign * surface[:, 0] < half + 0.12)]
         placed[rows] = _tube(draft[rows], arm, sign, half)
-    placed = _push_outside(placed, body, clearance=0.008)
-    placed = _push_edges_outside(placed, unique_edges(mesh.faces), body)
-    # Where panels coincide triangles have no area, and newton would leave them out.
-    placed += np.random.default_rng(0).normal(scale=2e-4, size=placed.shape)
+    placed = clear_of_body(placed, mesh, body.scene)
     root = first.transforms[0]
     return placed @ root[:3, :3].T + root[:3, 3]
+
+
+def clear_of_body(points: np.ndarray, mesh: PanelMesh, body: TriangleScene) -> np.ndarray:
+    """Panels hung around a body, (V, 3), moved to where no vertex and no edge of them is in it."""
+    surface = _Surface(body)
+    points = _push_outside(points, surface, clearance=0.008)
+    points = _push_edges_outside(points, unique_edges(mesh.faces), surface)
+    # Where panels coincide triangles have no area, and newton would leave them out.
+    return points + np.random.default_rng(0).normal(scale=2e-4, size=points.shape)
 
 
 def _tube(draft: np.ndarray, arm: np.ndarray, sign: float, start_x: float) -> np.ndarray:
@@ -195,6 +208,7 @@ def simulate(
     config: SimulationConfig,
     *,
     made: Made | None = None,
+    held_from: float | None = None,
 ) -> Iterator[np.ndarray]:
     """Move the cloth through a sequence of body poses, `1 / config.fps` apart.
 
@@ -203,6 +217,7 @@ def simulate(
     Args:
         start: (V, 3) cloth in the first frame, metres.
         made: how the garment was made; of one layer, without a share of its cloth that is the same everywhere, if None.
+        held_from: height in the rest pose below which the cloth is held less, metres; that of the shoulders if None.
     Yields:
         Cloth vertices (V, 3) float64 for each frame, the first included.
     """
@@ -224,7 +239,8 @@ def simulate(
         if frame == config.calm_frames and config.hold_hz > 0:
             cloth = state.particle_q.numpy().astype(np.float64)
             spread = 0 if made is None else made.folds.hold_spread
-            hold = _Hold.take(mesh, cloth, bodies[frame - 1], model.particle_mass.numpy(), config, spread)
+            masses = model.particle_mass.numpy()
+            hold = _Hold.take(mesh, cloth, bodies[frame - 1], masses, config, spread=spread, held_from=held_from)
         held = None if hold is None else (hold.places(bodies[frame - 1]), hold.places(bodies[frame]))
         calm = frame <= config.calm_frames
         between = _Walls.of(made, bodies[frame], model.particle_mass.numpy())
@@ -276,14 +292,19 @@ class _Hold:
         body: PosedBody,
         masses: np.ndarray,
         config: SimulationConfig,
+        *,
         spread: int,
+        held_from: float | None,
     ) -> _Hold:
-        """Hold the cloth, (V, 3) with limbs well apart, where it is on the body now; firmest at the shoulders.
+        """Hold the cloth, (V, 3) with limbs well apart, where it is on the body now; firmest at the shoulders, or from
+        another height upwards.
 
         Args:
             spread: passes that smooth the skin weights over the cloth.
+            held_from: that height in the rest pose, metres; None: that of the shoulders.
         """
-        _, _, weights = bind(cloth, mesh.faces, body)
+        # Diffused over a coarse sheet, weights would let the thighs turn a waistband.
+        _, _, weights = bind(cloth, mesh.faces, body, smoothing=WEIGHT_SMOOTHING if held_from is None else 0)
         adjacency = vertex_adjacency(mesh.faces, mesh.vertex_count).astype(np.float64)
         around = np.asarray(adjacency.sum(axis=1)).reshape(-1, 1)
         for _ in range(spread):
@@ -291,8 +312,9 @@ class _Hold:
         rest, flagged = unskin(cloth, weights, body.transforms)
         assert not flagged.any(), "the dressing pose cannot be unposed"
         bumps = smooth_noise(mesh.noise_uv, config.hold_ripple_m, config.hold_ripple_width_m, np.random.default_rng(1))
-        shoulder = body.shaped.joints[body.shaped.body.joint_names.index("upperarm01.L")]
-        below = np.maximum(shoulder[1] - rest[:, 1], 0) / config.hold_depth_m
+        if held_from is None:
+            held_from = float(body.shaped.joints[body.shaped.body.joint_names.index("upperarm01.L")][1])
+        below = np.maximum(held_from - rest[:, 1], 0) / config.hold_depth_m
         share = config.hold_floor + (1 - config.hold_floor) * np.exp(-(below**2))
         rest = rest + bumps[:, None] * vertex_normals(rest, mesh.faces)
         return _Hold(rest, weights, ((2 * np.pi * config.hold_hz) ** 2 * share * masses)[:, None])

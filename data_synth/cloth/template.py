@@ -20,15 +20,23 @@ def carry(source: PanelMesh, target: PanelMesh, positions: np.ndarray) -> np.nda
 
 
 def bind_template(
-    mesh: PanelMesh, dressed: np.ndarray, dressed_body: PosedBody, settled: np.ndarray, settled_body: PosedBody
+    mesh: PanelMesh,
+    dressed: np.ndarray,
+    dressed_body: PosedBody,
+    settled: np.ndarray,
+    settled_body: PosedBody,
+    *,
+    skin_weights: np.ndarray | None = None,
 ) -> Garment:
     """Bind to the body where the limbs are well apart, and take the shape from where the cloth has settled.
 
     Args:
         dressed: (V, 3) vertices in the dressing pose, arms held out.
         settled: (V, 3) vertices in the pose the clip starts with.
+        skin_weights: (V, J) of cloth that hangs loose; those of the skin beneath if None.
     """
     faces, barycentric, weights = bind(dressed, mesh.faces, dressed_body)
+    weights = weights if skin_weights is None else skin_weights
     rest, flagged = unskin(settled, weights, settled_body.transforms)
     assert not flagged.any(), "the clip's first pose cannot be unposed"
     return Garment(

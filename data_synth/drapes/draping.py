@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from capture4d.body.binding import bind, diffuse
+from capture4d.body.binding import bind, diffuse, loose_weights, weights_around
 from capture4d.body.skinning import PosedBody, ShapedBody, blend_transforms, skin, unskin, with_pose, with_shape
 from capture4d.geometry.mesh import vertex_adjacency, vertex_normals
 from capture4d.types import Body
@@ -27,8 +27,6 @@ from data_synth.drapes.solver import FRAME_SUBSTEPS, SUBSTEP_S, Planes, Sheet, a
 
 __all__ = ["Drape", "Draper", "symmetric_person"]
 
-SKIRT_NEIGHBOURS = 100
-"""Body vertices that a skirt's vertex follows (TailorNet, section 4.1, for loose garments)."""
 CLOSING_FRAMES, CLOSING_KEEP = 60, 0.95
 """In which panels hung around the body come to lie on it, and the share of the velocity that a substep leaves then."""
 RIPPLE_WIDTH_M = (0.012, 0.02)
@@ -263,14 +261,10 @@ class _Fitting:
         """Skin weights of the garment, (V, J), the same on both sides."""
         skin_weights = self.person.body.skin_weights
         if self.root_weights:
-            weights = np.zeros((len(points), skin_weights.shape[1]))
-            weights[:, 0] = 1.0
-            return weights
+            return loose_weights(points, self.body, follow="root")
         if self.by_distance:
             legs = np.flatnonzero(self.part_masks.any(axis=0))
-            distance, near = KDTree(self.body.vertices()[legs]).query(points, k=SKIRT_NEIGHBOURS)
-            shares = 1 / np.maximum(distance, 1e-4)
-            weights = np.einsum("vk,vkj->vj", shares, skin_weights[legs[near]])
+            weights = weights_around(points, self.body.vertices()[legs], skin_weights[legs])
         else:
             weights = bind(points, self.mesh.faces, self.body)[2]
         assert self.mesh.mirror is not None

@@ -12,7 +12,7 @@ from tyro.conf import Positional, arg
 from capture4d.cli.exit_codes import BAD_RESULT, GOOD
 from capture4d.cli.options import MeshOptions
 from capture4d.settings import Positive, Whole
-from capture4d.templates.config import Axis, MeshUnits, Region, TemplateConfig, UvChoice
+from capture4d.templates.config import Axis, Follow, MeshUnits, Region, TemplateConfig, UvChoice
 from registration.config import MeshRegistrationConfig
 
 __all__ = ["ConvertBody", "ConvertPoses", "ConvertRig", "RegisterMesh", "Template"]
@@ -47,6 +47,9 @@ class Template(FileOptions, MeshOptions):
     """Keep the mesh's UVs or cut fresh ones; `auto` keeps them if nothing is wrong with them."""
     names: tuple[str, ...] = ()
     """Names of the border loops, the one with the most vertices first; found by their place if absent."""
+    follow: Follow = "skin"
+    """What moves the garment: the skin beneath it; of one that hangs loose, such as a skirt, the mean of trunk and legs
+    around it, weighted by inverse distance; or the root joint alone."""
     uv_is_pattern: bool = False
     """The mesh's UVs are its sewing pattern: registration takes the cloth's lengths from them. Without this they are
     compared with one, and the command says what it found."""
@@ -74,6 +77,7 @@ class Template(FileOptions, MeshOptions):
             self.up,
             self.uv_is_pattern,
             self.wrap,
+            self.follow,
         )
         result = pipeline.template(
             self.mesh,

@@ -157,7 +157,10 @@ def test_a_reversed_clip_is_the_clip_from_its_end(person: ShapedBody) -> None:
     np.testing.assert_array_equal(backwards.frame_ids, forwards.frame_ids)
 
 
-@pytest.mark.parametrize("clip", ["walk", "hop", "arm-circles", "reach-twist"])
+@pytest.mark.parametrize(
+    "clip",
+    ["walk", "hop", "arm-circles", "reach-twist", "lunge", "squat", "sit", "reach-down", "range-of-legs"],
+)
 def test_clips_stay_on_the_floor_and_move_no_faster_than_people(person: ShapedBody, clip: str) -> None:
     poses = make_motion(person, MotionConfig(clip), 60.0, 150, np.random.default_rng(0))
     turned = np.swapaxes(poses.rotations[:-1], -1, -2) @ poses.rotations[1:]
@@ -167,3 +170,14 @@ def test_clips_stay_on_the_floor_and_move_no_faster_than_people(person: ShapedBo
     lowest = [pose_frame(person, poses, frame).vertices()[:, 1].min() for frame in range(0, 150, 10)]
     assert -0.03 < min(lowest) < 0.03
     assert max(lowest) < 0.35
+
+
+@pytest.mark.parametrize(("clip", "lowest_m"), [("squat", 0.25), ("sit", 0.25), ("lunge", 0.15), ("reach-down", 0.02)])
+def test_knees_bend_over_feet_that_stay_where_they_are(person: ShapedBody, clip, lowest_m: float) -> None:
+    poses = make_motion(person, MotionConfig(clip), 60.0, 90, np.random.default_rng(0))
+    feet = [person.body.joint_names.index(f"foot.{side}") for side in "LR"]
+    bodies = [pose_frame(person, poses, frame) for frame in range(0, 90, 6)]
+    middles = np.array([body.joint_centres()[feet].mean(axis=0) for body in bodies])
+    assert np.ptp(middles[:, [0, 2]], axis=0).max() < 1e-4
+    assert max(abs(body.vertices()[:, 1].min()) for body in bodies) < 1e-4
+    assert np.ptp(poses.translations[:, 1]) > lowest_m

@@ -24,6 +24,7 @@ from capture4d.templates.garment import make_template
 from capture4d.templates.stage import run
 from capture4d.types import Mesh
 from data_synth.motions import CLIPS, scripted_clip
+from tests.shapes import tube_faces
 
 SHAPE = np.array([0.5, -0.6, 0.3], np.float32)
 LOOPS = {
@@ -154,6 +155,33 @@ def test_what_cannot_be_a_template_is_told_in_one_line(tmp_path: Path, person: S
         main(["template", "--output", str(tmp_path / "template.npz")])
     assert stopped.value.code == 1
     assert capsys.readouterr().err == "capture4d: template: expected a mesh or --region, found neither\n"
+
+
+@pytest.mark.parametrize("follow", ["skin", "distance", "root"])
+def test_a_skirt_has_a_waist_and_a_hem(person: ShapedBody, follow) -> None:
+    skirt = _tube(person, top=0.1, bottom=-0.45)
+    garment, _ = make_template(skirt, _rest(person), follow=follow)
+    assert set(garment.loops) == {"waist", "hem"}
+    assert skirt.vertices[garment.loops["waist"], 1].min() > skirt.vertices[garment.loops["hem"], 1].max()
+    names, weights = person.body.joint_names, garment.skin_weights
+    assert weights is not None
+    arms = [index for index, name in enumerate(names) if name.startswith(("upperarm", "lowerarm", "wrist"))]
+    assert weights[:, arms].sum(axis=1).max() < (0.3 if follow == "distance" else 1.1)
+    assert (weights[:, 0] == 1).all() == (follow == "root")
+
+
+def test_a_tube_around_the_chest_has_a_neck(person: ShapedBody) -> None:
+    garment, _ = make_template(_tube(person, top=0.4, bottom=-0.1), _rest(person))
+    assert set(garment.loops) == {"neck", "hem"}
+
+
+def _tube(person: ShapedBody, *, top: float, bottom: float) -> Mesh:
+    """Around the trunk, from so far above the root joint to so far below, metres."""
+    root = person.joints[person.body.joint_names.index("root")]
+    angle = np.tile(2 * np.pi * np.arange(60) / 60, 24)
+    height = np.repeat(np.linspace(bottom, top, 24), 60)
+    ring = np.stack([0.2 * np.sin(angle), height, 0.16 * np.cos(angle)], axis=1)
+    return Mesh((root + ring).astype(np.float32), tube_faces(60, 24))
 
 
 def _rest(person: ShapedBody) -> PosedBody:

@@ -17,7 +17,7 @@ from data_synth.drapes.garments import GARMENTS
 BORDERS = {
     "tshirt": {"neck", "hem", "cuff_left", "cuff_right"},
     "shirt": {"neck", "hem", "cuff_left", "cuff_right"},
-    "trousers": {"waist", "cuff_left", "cuff_right"},
+    "trousers": {"waist", "leg_left", "leg_right"},
     "skirt": {"waist", "hem"},
     "necktie": {"outline"},
 }
