@@ -89,7 +89,7 @@ def _measure(config: DrapesConfig, *, pairs: int, simulator: bool) -> tuple[Drap
         started = time.process_time()
         drapes.append(draper.drape(pose))
         costs.append(time.process_time() - started)
-        quality.append(measure_drape(draper, pose, drapes[-1]))
+        quality.append(measure_drape(draper, pose, drapes[-1])[0])
     areas = [face_area_ratios(draper, drape.vertices) for drape in drapes]
     low, high = AREA_LIMITS
     row = {

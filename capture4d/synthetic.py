@@ -80,9 +80,14 @@ def synth_drapes(
 ) -> StageResult:
     """Drape a garment over a still body in many poses, to learn from; `failed` are the drapes that are not fit for it.
 
+    `report.html` in the folder draws what pruning costs, and where cloth is stretched, crushed or runs through itself.
+
     Raises:
         InputError: the style or the shape is none, or the folder holds something else.
     """
+    from capture4d.app.report.drapes import write_page
     from data_synth.drapes.stage import run as stage
 
-    return stage(Path(output), config or DrapesConfig(), workers=workers, overwrite=overwrite)
+    result = stage(Path(output), config or DrapesConfig(), workers=workers, overwrite=overwrite)
+    write_page(result.path)
+    return result

@@ -108,21 +108,18 @@ class Hold:
     """How far below that the hold has fallen to a third of the way to `floor`."""
     floor: Share
     """Share of the hold far below."""
-    ripple_m: NonNegative = 0.0
-    """Standard deviation of fixed bumps of the place, metres. They decide how the cloth buckles; the same on both sides
-    of the body."""
 
 
 CLOTHS: dict[str, Cloth] = {
-    "tshirt": Cloth(),
-    "shirt": Cloth(),
+    "tshirt": Cloth(bending=1e-4, friction=0.05),
+    "shirt": Cloth(bending=1e-4, friction=0.05),
     "trousers": Cloth(density=0.28, bending=4e-5),
     "skirt": Cloth(density=0.22, bending=3e-5),
     "necktie": Cloth(density=0.45, stretch_stiffness=600.0, bending=4e-4),
 }
 HOLDS: dict[str, Hold] = {
-    "tshirt": Hold(hz=10.0, depth_m=0.09, floor=0.07, ripple_m=0.007),
-    "shirt": Hold(hz=10.0, depth_m=0.09, floor=0.07, ripple_m=0.007),
+    "tshirt": Hold(hz=7.0, depth_m=0.09, floor=0.35),
+    "shirt": Hold(hz=7.0, depth_m=0.09, floor=0.35),
     "trousers": Hold(hz=25.0, depth_m=0.04, floor=0.02),
     "skirt": Hold(hz=25.0, depth_m=0.04, floor=0.0),
     "necktie": Hold(hz=0.0, depth_m=0.04, floor=0.0),
@@ -230,6 +227,6 @@ class DrapesConfig:
     shard: Annotated[int, Range(least=1, most=4096)] = 64
     """Drapes in a file."""
     garment_seed: Whole = 0
-    """Of the mesh and the garment's own bumps: equal for sets that are to have one topology."""
+    """Of the mesh: equal for sets that are to have one topology."""
     poses: PoseConfig = field(default_factory=PoseConfig)
     solver: SolverConfig = field(default_factory=SolverConfig)
