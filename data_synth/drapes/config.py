@@ -90,8 +90,14 @@ class Cloth:
     """Mass of an area, kg/m2."""
     stretch_stiffness: Positive = 250.0
     """Of an edge, N/m."""
+    compression_stiffness: Positive = 5.0
+    """Of an edge that is shorter than at rest, N/m: what is pressed together wrinkles more finely than the mesh can, and
+    resists no more. As stiff as in tension it would snap into one large fold or another, whichever was near (tension
+    field theory: Pipkin, The Relaxed Energy Density for Isotropic Elastic Membranes, 1986)."""
     strain_limit: Annotated[float, Range(least=1)] = 1.06
     """Beyond this share of its length an edge does not give at all."""
+    compression_limit: Annotated[float, Range(least=0, most=1)] = 0.8
+    """Nor below this one."""
     bending: Positive = 2e-5
     """Bending stiffness, N m. 1e-5 gives folds, 1e-4 few of them; beyond 1e-3 one sweep a step makes it no stiffer."""
     friction: NonNegative = 0.1
@@ -111,15 +117,15 @@ class Hold:
 
 
 CLOTHS: dict[str, Cloth] = {
-    "tshirt": Cloth(bending=1e-4, friction=0.05),
-    "shirt": Cloth(bending=1e-4, friction=0.05),
+    "tshirt": Cloth(bending=5e-5),
+    "shirt": Cloth(bending=5e-5),
     "trousers": Cloth(density=0.28, bending=4e-5),
     "skirt": Cloth(density=0.22, bending=3e-5),
     "necktie": Cloth(density=0.45, stretch_stiffness=600.0, bending=4e-4),
 }
 HOLDS: dict[str, Hold] = {
-    "tshirt": Hold(hz=7.0, depth_m=0.09, floor=0.35),
-    "shirt": Hold(hz=7.0, depth_m=0.09, floor=0.35),
+    "tshirt": Hold(hz=10.0, depth_m=0.09, floor=0.07),
+    "shirt": Hold(hz=10.0, depth_m=0.09, floor=0.07),
     "trousers": Hold(hz=25.0, depth_m=0.04, floor=0.02),
     "skirt": Hold(hz=25.0, depth_m=0.04, floor=0.0),
     "necktie": Hold(hz=0.0, depth_m=0.04, floor=0.0),

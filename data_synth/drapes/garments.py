@@ -23,7 +23,7 @@ from data_synth.drapes.config import STYLES, GarmentName, Style
 __all__ = ["GARMENTS", "PINNED_M", "Garment", "Placement", "panel_vertices", "parse_style", "style_values"]
 
 SIDES = (("left", "L", 1.0), ("right", "R", -1.0))
-ARM_SHARE = 0.1
+ARM_SHARE = 0.2
 """Skin weight of arm, shoulder and collar bone from which skin is of the arm: it reaches so far over chest and back that
 no shoulder shows through a sleeve, which meets nothing else."""
 PINNED_M = 0.012

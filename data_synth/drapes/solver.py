@@ -45,10 +45,10 @@ class Sheet:
     lengths: np.ndarray
     """(E,) at rest, on the pattern."""
     edge_firmness: np.ndarray
-    """(E, 2) kilograms: by how much of its excess an edge is corrected in a substep, and beyond the strain limit, over
-    the inverse mass of each end."""
-    strain_limit: float
-    """Beyond this share of its length an edge does not give at all."""
+    """(E, 3) kilograms: by how much of its excess a stretched edge is corrected in a substep, one beyond the limits, and
+    a compressed one, over the inverse mass of each end."""
+    strain_limits: tuple[float, float]
+    """Beyond these shares of its length an edge does not give at all."""
     hinges: np.ndarray
     """(Q, 4) int32: the ends of an inner edge, then the vertices opposite."""
     hinge_weights: np.ndarray
@@ -75,7 +75,8 @@ class Sheet:
         edge_order, hinge_order = _by_sides(edges, mesh.mirror), _by_sides(stencils[:, :2], mesh.mirror)
         edges, lengths = edges[edge_order], lengths[edge_order]
         both = inverse_masses[edges].sum(axis=1)
-        firmness = 1 / np.maximum(np.stack([both + 1 / cloth.stretch_stiffness / SUBSTEP_S**2, both], axis=1), 1e-9)
+        gives = 1 / (np.array([cloth.stretch_stiffness, np.inf, cloth.compression_stiffness]) * SUBSTEP_S**2)
+        firmness = 1 / np.maximum(both[:, None] + gives, 1e-9)
         firmness[both == 0] = 0
         stencils, weights = stencils[hinge_order], weights[hinge_order, :4]
         # Energy of a hinge: 3 k / (A1 + A2) times half the squared stencil; A from the faces around its corners.
@@ -85,7 +86,7 @@ class Sheet:
             edges=np.ascontiguousarray(edges, np.int32),
             lengths=lengths,
             edge_firmness=firmness,
-            strain_limit=cloth.strain_limit,
+            strain_limits=(cloth.compression_limit, cloth.strain_limit),
             hinges=np.ascontiguousarray(stencils, np.int32),
             hinge_weights=np.ascontiguousarray(weights),
             hinge_moves=pulled / ((weights * pulled).sum(axis=1) + hinge_give)[:, None],
@@ -140,7 +141,7 @@ def advance(
         sheet.edges,
         sheet.lengths,
         sheet.edge_firmness,
-        sheet.strain_limit,
+        *sheet.strain_limits,
         sheet.hinges,
         sheet.hinge_weights,
         sheet.hinge_moves,
@@ -163,7 +164,8 @@ def _advance(
     edges,
     lengths,
     firmness,
-    strain_limit,
+    shortest,
+    longest,
     hinges,
     weights,
     moves,
@@ -210,7 +212,7 @@ def _advance(
                 x[i, 1] -= stuck * ty
                 x[i, 2] -= stuck * tz
         _bend(x, hinges, weights, moves, substep % 2 == 0)
-        _stretch(x, inverse_mass, edges, lengths, firmness, strain_limit, substep % 2 == 0)
+        _stretch(x, inverse_mass, edges, lengths, firmness, shortest, longest, substep % 2 == 0)
         for i in range(len(x)):
             dx, dy, dz = x[i, 0] - before[i, 0], x[i, 1] - before[i, 1], x[i, 2] - before[i, 2]
             gain = keep / h * min(1.0, FARTHEST_M / (np.sqrt(dx * dx + dy * dy + dz * dz) + 1e-12))
@@ -233,14 +235,18 @@ def _bend(x, hinges, weights, moves, forward):
 
 
 @njit(cache=True, fastmath=True, nogil=True, inline="always")
-def _stretch(x, inverse_mass, edges, lengths, firmness, limit, forward):
+def _stretch(x, inverse_mass, edges, lengths, firmness, shortest, longest, forward):
     for q in range(len(edges)):
         e = q if forward else len(edges) - 1 - q
         i, j = edges[e, 0], edges[e, 1]
         mi, mj = inverse_mass[i], inverse_mass[j]
         dx, dy, dz = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
         size = np.sqrt(dx * dx + dy * dy + dz * dz) + 1e-9
-        move = max((size - lengths[e]) * firmness[e, 0], (size - limit * lengths[e]) * firmness[e, 1]) / size
+        length = lengths[e]
+        if size > length:
+            move = max((size - length) * firmness[e, 0], (size - longest * length) * firmness[e, 1]) / size
+        else:
+            move = min((size - length) * firmness[e, 2], (size - shortest * length) * firmness[e, 1]) / size
         x[i, 0] += mi * move * dx
         x[i, 1] += mi * move * dy
         x[i, 2] += mi * move * dz
