@@ -91,9 +91,9 @@ class Cloth:
     stretch_stiffness: Positive = 250.0
     """Of an edge, N/m."""
     compression_stiffness: Positive = 5.0
-    """Of an edge that is shorter than at rest, N/m: what is pressed together wrinkles more finely than the mesh can, and
-    resists no more. As stiff as in tension it would snap into one large fold or another, whichever was near (tension
-    field theory: Pipkin, The Relaxed Energy Density for Isotropic Elastic Membranes, 1986)."""
+    """Of an edge that is shorter than at rest, N/m: what is pressed together wrinkles more finely than the mesh can,
+    and hardly resists. As stiff as in tension it would snap into one large fold or another, whichever was near
+    (tension field theory: Pipkin, The Relaxed Energy Density for Isotropic Elastic Membranes, 1986)."""
     strain_limit: Annotated[float, Range(least=1)] = 1.06
     """Beyond this share of its length an edge does not give at all."""
     compression_limit: Annotated[float, Range(least=0, most=1)] = 0.8
@@ -126,7 +126,7 @@ CLOTHS: dict[str, Cloth] = {
 HOLDS: dict[str, Hold] = {
     "tshirt": Hold(hz=10.0, depth_m=0.09, floor=0.07),
     "shirt": Hold(hz=10.0, depth_m=0.09, floor=0.07),
-    "trousers": Hold(hz=25.0, depth_m=0.04, floor=0.02),
+    "trousers": Hold(hz=40.0, depth_m=0.04, floor=0.02),
     "skirt": Hold(hz=25.0, depth_m=0.04, floor=0.0),
     "necktie": Hold(hz=0.0, depth_m=0.04, floor=0.0),
 }

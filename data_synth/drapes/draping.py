@@ -24,14 +24,14 @@ from data_synth.drapes.dressing import base_garment, mirrored
 from data_synth.drapes.garments import GARMENTS, PINNED_M, Garment, panel_vertices, parse_style
 from data_synth.drapes.solver import FRAME_SUBSTEPS, SUBSTEP_S, Planes, Sheet, advance
 
-__all__ = ["Drape", "Draper", "symmetric_person"]
+__all__ = ["Drape", "Draper", "part_contacts", "symmetric_person"]
 
 SKIRT_NEIGHBOURS = 100
 """Body vertices that a skirt's vertex follows (TailorNet, section 4.1, for loose garments)."""
 CLOSING_FRAMES, CLOSING_KEEP = 60, 0.95
 """In which panels hung around the body come to lie on it, and the share of the velocity that a substep leaves then."""
 WEIGHT_SMOOTHING = 20
-"""Further diffusion steps on skin weights: places that bend over a wider stretch of cloth hold it without crumpling it."""
+"""Further diffusion steps on skin weights: places that bend over a wider stretch do not crumple what they hold."""
 OFFSET_SMOOTHING = 12
 """Diffusion steps on how the cloth moves to another person's body."""
 
@@ -162,7 +162,7 @@ class _Fitting:
         self.sheet = Sheet.create(mesh, CLOTHS[config.garment], self.pinned)
         self.part_masks = kind.parts(person)
         self.parts = BodyParts.create(person, self.part_masks)
-        self.contacts = _contacts(mesh, panels, kind)
+        self.contacts = part_contacts(mesh, panels, kind)
         self.body = with_pose(person, kind.dressing(person), np.zeros(3))
 
     def put_on(self, points: np.ndarray) -> _Worn:
@@ -294,7 +294,7 @@ def _other_side(names: tuple[str, ...]) -> np.ndarray:
     )
 
 
-def _contacts(mesh: PanelMesh, panels: np.ndarray, kind: Garment) -> tuple[np.ndarray, np.ndarray]:
+def part_contacts(mesh: PanelMesh, panels: np.ndarray, kind: Garment) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and the part of the body each meets, (C,) int32.
 
     It is one part for each, but for skirts: cloth that two parts squeeze between them is pushed from one into the other

@@ -24,8 +24,8 @@ __all__ = ["GARMENTS", "PINNED_M", "Garment", "Placement", "panel_vertices", "pa
 
 SIDES = (("left", "L", 1.0), ("right", "R", -1.0))
 ARM_SHARE = 0.2
-"""Skin weight of arm, shoulder and collar bone from which skin is of the arm: it reaches so far over chest and back that
-no shoulder shows through a sleeve, which meets nothing else."""
+"""Skin weight of arm, shoulder and collar bone from which skin is of the arm's part: a sleeve meets nothing else, and
+at 0.35 the shoulder showed in front of its cap."""
 PINNED_M = 0.012
 """Of a garment that is pinned, what is nearer to its upper end is fixed to the skin."""
 ASPECT = 0.75

@@ -45,8 +45,8 @@ class Sheet:
     lengths: np.ndarray
     """(E,) at rest, on the pattern."""
     edge_firmness: np.ndarray
-    """(E, 3) kilograms: by how much of its excess a stretched edge is corrected in a substep, one beyond the limits, and
-    a compressed one, over the inverse mass of each end."""
+    """(E, 3) kilograms: by how much of its excess a stretched edge is corrected in a substep, one beyond the limits,
+    and a compressed one, over the inverse mass of each end."""
     strain_limits: tuple[float, float]
     """Beyond these shares of its length an edge does not give at all."""
     hinges: np.ndarray

@@ -1,4 +1,4 @@
-"""A set of drapes for people to read: what pruning costs, where cloth is stretched or crushed, and where it cuts itself.
+"""A set of drapes to look at: what pruning costs, where cloth is stretched or crushed, and where it cuts itself.
 
 References: the plots of joint angles before and after pruning, of area distortion and of self-intersections by face are
 those of Jin et al., A Pixel-Based Framework for Data-Driven Clothing (SCA 2020), appendix.
