@@ -1,8 +1,9 @@
 """Cloth at rest on a still body: a small-step solver in one compiled loop.
 
-Every substep predicts, pulls the cloth towards where the garment is held, bends, stretches, and resolves contact with
-friction, constraint by constraint, once. Short substeps stand for iterations: the sag of a sheet that is not solved to
-the end goes with the square of the step, and at 1/360 s edges around the armholes stay stretched by half.
+Every substep predicts, pulls the cloth towards where the garment is held, resolves contact with friction, bends, and
+stretches, constraint by constraint, once. Edges come last: contact would leave faces crushed where the body is creased.
+Short substeps stand for iterations: the sag of a sheet that is not solved to the end goes with the square of the step,
+and at 1/360 s edges around the armholes stay stretched by half.
 
 Left and right are treated alike: a constraint is followed by its mirror image, so that the mirror image of a pose gives
 the mirror image of the drape as far as rounding and the constraints across the middle allow.
