@@ -3,7 +3,8 @@
 Limits this benchmark was built against, at 3,000 vertices: at most 0.4 CPU seconds a drape, at least 85 % kept by the
 area rule of Jin et al., two ways into a pose within 5 mm, a mirrored pose within 4 mm of the mirrored drape, a tenth of
 a degree in every joint within 3 mm, at most 0.05 % of the vertices inside the body, 99 % of edges within 1.15 of their
-length (1.2 with arms overhead).
+length (1.2 with arms overhead). Against the moving simulator on its way into the same pose: 20 times cheaper, the 99th
+percentile of stretch within 0.02, the hem within 12 mm of its height.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.metric import Metric
 from capture4d.body.anny import load_anny
 from capture4d.body.skinning import with_pose
+from capture4d.geometry.mesh import edge_lengths
 from capture4d.runs.workers import run_jobs
 from data_synth.cloth.simulation import simulate
 from data_synth.config import FABRICS, SimulationConfig
@@ -89,7 +91,7 @@ def _measure(config: DrapesConfig, *, pairs: int, simulator: bool) -> tuple[Drap
         started = time.process_time()
         drapes.append(draper.drape(pose))
         costs.append(time.process_time() - started)
-        quality.append(measure_drape(draper, pose, drapes[-1]))
+        quality.append(measure_drape(draper, pose, drapes[-1])[0])
     areas = [face_area_ratios(draper, drape.vertices) for drape in drapes]
     low, high = AREA_LIMITS
     row = {
@@ -119,7 +121,12 @@ def _measure(config: DrapesConfig, *, pairs: int, simulator: bool) -> tuple[Drap
         apart["tenth_degree_mm"].append(_apart_mm(drape, draper.drape(near).vertices))
     row |= {key: (float(np.mean(values)), "mm") for key, values in apart.items()}
     if simulator and config.garment == "tshirt":
-        row["ratio_to_simulator"] = (_simulator_cpu_s(draper, poses[0]) / row["drape_cpu_s"][0], "")
+        cost, cloth = _simulated(draper, poses[0])
+        hem = draper.mesh.loops["hem"]
+        apart_m = float(np.mean(cloth[hem, 1]) - np.mean(drapes[0].vertices[hem, 1]))
+        row["ratio_to_simulator"] = (cost / row["drape_cpu_s"][0], "")
+        row["stretch_beyond_simulator"] = (abs(quality[0].stretch_p99 - _stretch_p99(draper, cloth)), "")
+        row["hem_to_simulator_mm"] = (1e3 * abs(apart_m), "mm")
     return config, row
 
 
@@ -135,8 +142,13 @@ def _mirrored_pose(rotations: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
     return flip @ rotations[other] @ flip
 
 
-def _simulator_cpu_s(draper: Draper, pose: np.ndarray) -> float:
-    """CPU seconds of the moving simulator on its way from the dressing pose, until the cloth moves as little."""
+def _stretch_p99(draper: Draper, vertices: np.ndarray) -> float:
+    return float(np.percentile(edge_lengths(vertices, draper.sheet.edges) / draper.sheet.lengths, 99))
+
+
+def _simulated(draper: Draper, pose: np.ndarray) -> tuple[float, np.ndarray]:
+    """CPU seconds of the moving simulator on its way from the dressing pose, until the cloth moves as little as a
+    drape's; and where it is then, (V, 3)."""
     turns = Rotation.from_matrix(np.einsum("jba,jbc->jac", draper.dressing, pose)).as_rotvec()
     way = [
         np.einsum("jab,jbc->jac", draper.dressing, Rotation.from_rotvec(turns * share).as_matrix())
@@ -153,4 +165,4 @@ def _simulator_cpu_s(draper: Draper, pose: np.ndarray) -> float:
         before = cloth
         if number > WAY_FRAMES + 2 and still:
             break
-    return time.process_time() - started
+    return time.process_time() - started, before

@@ -87,11 +87,16 @@ def synth_drapes(
 ) -> StageResult:
     """Drape a garment over a still body in many poses, to learn from; `failed` are the drapes that are not fit for it.
 
+    `report.html` in the folder of one person and style draws what pruning costs, and where cloth is stretched, crushed
+    or runs through itself.
+
     Args:
         config: of one style on one person; or name or settings of a style set, such as "tiny-styles".
+
     Raises:
         InputError: the style, the shape or the preset is none, or the folder holds something else.
     """
+    from capture4d.app.report.drapes import write_page
     from data_synth.drapes.stage import run as stage
     from data_synth.styles.stage import run as style_set
 
@@ -102,7 +107,9 @@ def synth_drapes(
     if isinstance(config, StyleSetConfig):
         return style_set(Path(output), config, workers=workers, overwrite=overwrite)
 
-    return stage(Path(output), config or DrapesConfig(), workers=workers, overwrite=overwrite)
+    result = stage(Path(output), config or DrapesConfig(), workers=workers, overwrite=overwrite)
+    write_page(result.path)
+    return result
 
 
 @logged_stage("fit-styles")

@@ -2,7 +2,7 @@
 
 A sleeve collides with its arm and the front with the trunk, whatever is nearer: where an arm lies against the trunk, or
 two thighs touch, cloth between them would otherwise be pulled to both sides (Jin et al., A Pixel-Based Framework for
-Data-Driven Clothing, SCA 2020, section 5). Vertices beside the seam between two parts collide with both.
+Data-Driven Clothing, SCA 2020, section 5). Parts overlap, and a vertex meets one, whatever panel is sewn beside it.
 
 The nearest body vertex is found by walking downhill over the part's surface from where the garment was put on, and the
 nearest point in the triangles around it. No tree is built, a look-up of 3,000 vertices takes a millisecond.

@@ -90,8 +90,14 @@ class Cloth:
     """Mass of an area, kg/m2."""
     stretch_stiffness: Positive = 250.0
     """Of an edge, N/m."""
+    compression_stiffness: Positive = 5.0
+    """Of an edge that is shorter than at rest, N/m: what is pressed together wrinkles more finely than the mesh can,
+    and hardly resists. As stiff as in tension it would snap into one large fold or another, whichever was near
+    (tension field theory: Pipkin, The Relaxed Energy Density for Isotropic Elastic Membranes, 1986)."""
     strain_limit: Annotated[float, Range(least=1)] = 1.06
     """Beyond this share of its length an edge does not give at all."""
+    compression_limit: Annotated[float, Range(least=0, most=1)] = 0.8
+    """Nor below this one."""
     bending: Positive = 2e-5
     """Bending stiffness, N m. 1e-5 gives folds, 1e-4 few of them; beyond 1e-3 one sweep a step makes it no stiffer."""
     friction: NonNegative = 0.1
@@ -108,22 +114,19 @@ class Hold:
     """How far below that the hold has fallen to a third of the way to `floor`."""
     floor: Share
     """Share of the hold far below."""
-    ripple_m: NonNegative = 0.0
-    """Standard deviation of fixed bumps of the place, metres. They decide how the cloth buckles; the same on both sides
-    of the body."""
 
 
 CLOTHS: dict[str, Cloth] = {
-    "tshirt": Cloth(),
-    "shirt": Cloth(),
+    "tshirt": Cloth(bending=5e-5),
+    "shirt": Cloth(bending=5e-5),
     "trousers": Cloth(density=0.28, bending=4e-5),
     "skirt": Cloth(density=0.22, bending=3e-5),
     "necktie": Cloth(density=0.45, stretch_stiffness=600.0, bending=4e-4),
 }
 HOLDS: dict[str, Hold] = {
-    "tshirt": Hold(hz=10.0, depth_m=0.09, floor=0.07, ripple_m=0.007),
-    "shirt": Hold(hz=10.0, depth_m=0.09, floor=0.07, ripple_m=0.007),
-    "trousers": Hold(hz=25.0, depth_m=0.04, floor=0.02),
+    "tshirt": Hold(hz=10.0, depth_m=0.09, floor=0.07),
+    "shirt": Hold(hz=10.0, depth_m=0.09, floor=0.07),
+    "trousers": Hold(hz=40.0, depth_m=0.04, floor=0.02),
     "skirt": Hold(hz=25.0, depth_m=0.04, floor=0.0),
     "necktie": Hold(hz=0.0, depth_m=0.04, floor=0.0),
 }
@@ -230,6 +233,6 @@ class DrapesConfig:
     shard: Annotated[int, Range(least=1, most=4096)] = 64
     """Drapes in a file."""
     garment_seed: Whole = 0
-    """Of the mesh and the garment's own bumps: equal for sets that are to have one topology."""
+    """Of the mesh: equal for sets that are to have one topology."""
     poses: PoseConfig = field(default_factory=PoseConfig)
     solver: SolverConfig = field(default_factory=SolverConfig)

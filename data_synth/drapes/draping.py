@@ -15,21 +15,21 @@ from scipy.spatial.transform import Rotation
 
 from capture4d.body.binding import bind, diffuse, loose_weights, weights_around
 from capture4d.body.skinning import PosedBody, ShapedBody, blend_transforms, skin, unskin, with_pose, with_shape
-from capture4d.geometry.mesh import vertex_adjacency, vertex_normals
 from capture4d.types import Body
 from data_synth.cloth.panels import Pattern
-from data_synth.cloth.patterns import PanelMesh, grade, smooth_noise
+from data_synth.cloth.patterns import PanelMesh, grade
 from data_synth.drapes.collision import BodyParts, Wearing
 from data_synth.drapes.config import CLOTHS, HOLDS, STYLES, DrapesConfig, Hold, SolverConfig
 from data_synth.drapes.dressing import base_garment, mirrored
-from data_synth.drapes.garments import GARMENTS, PINNED_M, SEAM_RINGS, Garment, panel_vertices, parse_style
+from data_synth.drapes.garments import GARMENTS, PINNED_M, Garment, panel_vertices, parse_style
 from data_synth.drapes.solver import FRAME_SUBSTEPS, SUBSTEP_S, Planes, Sheet, advance
 
-__all__ = ["Drape", "Draper", "symmetric_person"]
+__all__ = ["Drape", "Draper", "part_contacts", "symmetric_person"]
 
 CLOSING_FRAMES, CLOSING_KEEP = 60, 0.95
 """In which panels hung around the body come to lie on it, and the share of the velocity that a substep leaves then."""
-RIPPLE_WIDTH_M = (0.012, 0.02)
+WEIGHT_SMOOTHING = 20
+"""Further diffusion steps on skin weights: places that bend over a wider stretch do not crumple what they hold."""
 OFFSET_SMOOTHING = 12
 """Diffusion steps on how the cloth moves to another person's body."""
 
@@ -53,11 +53,9 @@ class _Worn:
     vertices: np.ndarray
     skin_weights: np.ndarray
     rest: np.ndarray
-    """(V, 3) unposed."""
+    """(V, 3) unposed; it is held there."""
     start: np.ndarray
     """Body vertex under each contact."""
-    places: np.ndarray
-    """(V, 3) where it is held, unposed."""
     gain: np.ndarray
     """(V,) share of the way there that a substep pulls it."""
 
@@ -156,14 +154,13 @@ class _Fitting:
         self.kind, self.mesh, self.person = kind, mesh, person
         self.root_weights = config.garment == "skirt" and config.skirt_weights == "root"
         self.by_distance = config.garment == "skirt" and config.skirt_weights == "distance"
-        self.seed = config.garment_seed
         panels, draft = panel_vertices(mesh, draper.pattern)
         top = draft[:, 1] > draft[:, 1].max() - PINNED_M
         self.pinned = np.flatnonzero(top) if kind.pinned else np.zeros(0, int)
         self.sheet = Sheet.create(mesh, CLOTHS[config.garment], self.pinned)
         self.part_masks = kind.parts(person)
         self.parts = BodyParts.create(person, self.part_masks)
-        self.contacts = _contacts(mesh, panels, kind)
+        self.contacts = part_contacts(mesh, panels, kind)
         self.body = with_pose(person, kind.dressing(person), np.zeros(3))
 
     def put_on(self, points: np.ndarray) -> _Worn:
@@ -204,7 +201,7 @@ class _Fitting:
     ) -> None:
         """Move positions and velocities, both (V, 3) and changed in place, on a body that is still."""
         surface = self.parts.posed(body)
-        hold = skin(worn.places, worn.skin_weights, body.transforms), worn.gain
+        hold = skin(worn.rest, worn.skin_weights, body.transforms), worn.gain
         keep, step = self.solver.keep if keep is None else keep, self.solver.contact_substeps
         for done in range(0, substeps, step):
             planes = wearing.look_up(positions, surface)
@@ -218,7 +215,7 @@ class _Fitting:
     ) -> Drape:
         """Settle until the mean motion is small; then push out what the last half planes let in."""
         surface = self.parts.posed(body)
-        hold = skin(worn.places, worn.skin_weights, body.transforms), worn.gain
+        hold = skin(worn.rest, worn.skin_weights, body.transforms), worn.gain
         solver, motion = self.solver, np.inf
         frames = 0
         wearing.begin_again(positions, surface)
@@ -243,19 +240,13 @@ class _Fitting:
         weights = self._weights(points)
         rest, flagged = unskin(points, weights, self.body.transforms)
         assert not flagged.any(), "the dressing pose cannot be unposed"
-        hold, mesh = self.hold, self.mesh
-        below = np.maximum(self.kind.held_from(self.person, rest, mesh) - rest[:, 1], 0) / hold.depth_m
+        hold = self.hold
+        below = np.maximum(self.kind.held_from(self.person, rest, self.mesh) - rest[:, 1], 0) / hold.depth_m
         share = hold.floor + (1 - hold.floor) * np.exp(-(below**2))
         pull = (2 * np.pi * hold.hz * SUBSTEP_S) ** 2 * share
         gain = pull / (1 + pull)
         gain[self.pinned] = 1.0
-        bumps = np.zeros(len(rest))
-        if hold.ripple_m:
-            assert mesh.mirror is not None
-            bumps = smooth_noise(mesh.noise_uv, hold.ripple_m, RIPPLE_WIDTH_M, np.random.default_rng([self.seed, 1]))
-            bumps = bumps[np.minimum(np.arange(len(rest)), mesh.mirror)]
-        places = rest + bumps[:, None] * vertex_normals(rest, mesh.faces)
-        return _Worn(points, weights, rest, start, places, gain)
+        return _Worn(points, weights, rest, start, gain)
 
     def _weights(self, points: np.ndarray) -> np.ndarray:
         """Skin weights of the garment, (V, J), the same on both sides."""
@@ -266,7 +257,7 @@ class _Fitting:
             legs = np.flatnonzero(self.part_masks.any(axis=0))
             weights = weights_around(points, self.body.vertices()[legs], skin_weights[legs])
         else:
-            weights = bind(points, self.mesh.faces, self.body)[2]
+            weights = diffuse(bind(points, self.mesh.faces, self.body)[2], self.mesh.faces, WEIGHT_SMOOTHING)
         assert self.mesh.mirror is not None
         weights = weights + weights[self.mesh.mirror][:, _other_side(self.person.body.joint_names)]
         return weights / weights.sum(axis=1, keepdims=True)
@@ -297,23 +288,22 @@ def _other_side(names: tuple[str, ...]) -> np.ndarray:
     )
 
 
-def _contacts(mesh: PanelMesh, panels: np.ndarray, kind: Garment) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and the part of the body each meets, (C,) int32; near a seam between two parts, both."""
-    parts = max(part for met in kind.meets.values() for part in met) + 1
+def part_contacts(mesh: PanelMesh, panels: np.ndarray, kind: Garment) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and the part of the body each meets, (C,) int32.
+
+    It is one part for each, but for skirts: cloth that two parts squeeze between them is pushed from one into the other
+    and back, and ends as crushed and overstretched faces.
+    """
+    parts = max(part for met in (*kind.meets.values(), (kind.seam,)) for part in met) + 1
     meets = np.zeros((mesh.vertex_count, parts), bool)
     for face_panel in np.unique(mesh.face_panels):
-        corners = mesh.faces[mesh.face_panels == face_panel].ravel()
+        corners = np.unique(mesh.faces[mesh.face_panels == face_panel])
         name = panels[np.flatnonzero(mesh.face_panels[mesh.vertex_faces] == face_panel)[0]]
-        meets[np.unique(corners)[:, None], list(kind.meets[str(name)])] = True
-    adjacency = vertex_adjacency(mesh.faces, mesh.vertex_count)
-    seam = meets.sum(axis=1) > 1  # sewn between panels that meet different parts
-    near = seam
-    for _ in range(SEAM_RINGS):
-        near = near | (adjacency @ near.astype(np.float32) > 0)
-    beside = near & ~seam
-    for _ in range(SEAM_RINGS):
-        spread = adjacency @ (meets & near[:, None]).astype(np.float32) > 0
-        meets[beside] |= spread[beside]
+        own = np.zeros(parts, bool)
+        own[list(kind.meets[str(name)])] = True
+        sewn = corners[(meets[corners] & ~own).any(axis=1)]  # to a panel that meets another part
+        meets[corners] |= own
+        meets[sewn] = np.arange(parts) == kind.seam
     vertices, met = np.nonzero(meets)
     return vertices.astype(np.int32), met.astype(np.int32)
 

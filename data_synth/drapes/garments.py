@@ -23,8 +23,9 @@ from data_synth.drapes.config import STYLES, GarmentName, Style
 __all__ = ["GARMENTS", "PINNED_M", "Garment", "Placement", "panel_vertices", "parse_style", "style_values"]
 
 SIDES = (("left", "L", 1.0), ("right", "R", -1.0))
-SEAM_RINGS = 2
-"""So many rings of vertices beside the seam between two parts of the body collide with both."""
+ARM_SHARE = 0.2
+"""Skin weight of arm, shoulder and collar bone from which skin is of the arm's part: a sleeve meets nothing else, and
+at 0.35 the shoulder showed in front of its cap."""
 PINNED_M = 0.012
 """Of a garment that is pinned, what is nearer to its upper end is fixed to the skin."""
 ASPECT = 0.75
@@ -56,6 +57,8 @@ class Garment:
     """(P, B) bool: the body's vertices in each part that it meets."""
     meets: Mapping[str, tuple[int, ...]]
     """Parts that a panel meets, by its name."""
+    seam: int
+    """The part that vertices meet on a seam between panels that meet different ones."""
     held_from: Callable[[ShapedBody, np.ndarray, PanelMesh], float]
     """Height in the rest pose below which it is held less, from the garment's vertices at rest."""
     limbs: tuple[str, ...]
@@ -134,19 +137,19 @@ def _trunk_and_arms(person: ShapedBody) -> np.ndarray:
     upper_arms = [_share(person, "upperarm", "lowerarm", "wrist", side=side) for _, side, _ in SIDES]
     trunk = (np.max(upper_arms, axis=0) < 0.6) & ~low & (_share(person, "head") < 0.5)
     arms = [
-        (_share(person, "clavicle", "shoulder", "upperarm", "lowerarm", "wrist", side=side) > 0.35)
+        (_share(person, "clavicle", "shoulder", "upperarm", "lowerarm", "wrist", side=side) > ARM_SHARE)
         for _, side, _ in SIDES
     ]
     return np.stack([trunk, *arms])
 
 
 def _trunk_and_legs(person: ShapedBody) -> np.ndarray:
-    """The lower trunk with the left leg, and with the right; they overlap."""
+    """The lower trunk with the left leg, with the right, and with both."""
     names = person.body.joint_names
     chest = person.joints[names.index("spine02")][1]
     trunk = (person.vertices[:, 1] < chest) & (_share(person, "upperarm", "lowerarm", "wrist") < 0.3)
     other = [_share(person, "upperleg", "lowerleg", "foot", side=side) for side in ("R", "L")]
-    return np.stack([trunk & (share < 0.5) for share in other])
+    return np.stack([*(trunk & (share < 0.5) for share in other), trunk])
 
 
 def _trunk(person: ShapedBody) -> np.ndarray:
@@ -279,15 +282,18 @@ def _shirt_draft(person: ShapedBody, style: Any) -> Pattern:
 _SLEEVED = {"front": (0,), "back": (0,), "sleeve_left": (1,), "sleeve_right": (2,)}
 GARMENTS: Mapping[GarmentName, Garment] = {
     "tshirt": Garment(
-        tshirt_pattern, dressing_rotations, None, _trunk_and_arms, _SLEEVED, _at_shoulders, ("spine", "arms")
+        tshirt_pattern, dressing_rotations, None, _trunk_and_arms, _SLEEVED, 0, _at_shoulders, ("spine", "arms")
     ),
-    "shirt": Garment(_shirt_draft, _straight_arms, None, _trunk_and_arms, _SLEEVED, _at_shoulders, ("spine", "arms")),
+    "shirt": Garment(
+        _shirt_draft, _straight_arms, None, _trunk_and_arms, _SLEEVED, 0, _at_shoulders, ("spine", "arms")
+    ),
     "trousers": Garment(
         lambda person, style: trousers_pattern(person, **style_values(style)),
         _as_at_rest,
         _hang_trousers,
         _trunk_and_legs,
         {"front_left": (0,), "back_left": (0,), "front_right": (1,), "back_right": (1,)},
+        2,
         _at_waist,
         ("spine", "legs"),
     ),
@@ -297,6 +303,7 @@ GARMENTS: Mapping[GarmentName, Garment] = {
         _hang_skirt,
         _trunk_and_legs,
         {"front": (0, 1), "back": (0, 1)},
+        0,
         _at_waist,
         ("spine", "legs"),
     ),
@@ -306,6 +313,7 @@ GARMENTS: Mapping[GarmentName, Garment] = {
         _hang_necktie,
         _trunk,
         {"front": (0,)},
+        0,
         _at_top,
         ("spine",),
         pinned=True,

@@ -54,14 +54,15 @@ def face_area_ratios(draper: Draper, vertices: np.ndarray) -> np.ndarray:
     return face_areas(vertices, draper.mesh.faces) / draper.sheet.areas
 
 
-def measure_drape(draper: Draper, rotations: np.ndarray, drape: Drape) -> DrapeQuality:
-    """Measure a drape against its pattern and the body in its pose, (J, 3, 3)."""
+def measure_drape(draper: Draper, rotations: np.ndarray, drape: Drape) -> tuple[DrapeQuality, np.ndarray]:
+    """Measure a drape against its pattern and the body in its pose, (J, 3, 3); and which faces, (F,), cut another."""
     areas = face_area_ratios(draper, drape.vertices)
     stretch = edge_lengths(drape.vertices, draper.sheet.edges) / draper.sheet.lengths
     p99 = float(np.percentile(stretch, 99))
     body = with_pose(draper.person, rotations, np.zeros(3))
     inside = 100 * float(inside_parts(body, draper.part_masks, draper.contacts, drape.vertices).mean())
-    cut = 100 * float(self_intersections(drape.vertices, draper.mesh.faces).mean())
+    cuts = self_intersections(drape.vertices, draper.mesh.faces)
+    cut = 100 * float(cuts.mean())
     reasons = []
     crushed, over = int((areas < AREA_LIMITS[0]).sum()), int((areas > AREA_LIMITS[1]).sum())
     if crushed or over:
@@ -74,9 +75,10 @@ def measure_drape(draper: Draper, rotations: np.ndarray, drape: Drape) -> DrapeQ
         reasons.append(f"{cut:.0f} % of the faces cut others")
     if drape.motion_mm >= draper.config.solver.still_mm:
         reasons.append(f"not at rest: {drape.motion_mm:.2f} mm in the last 1/60 s")
-    return DrapeQuality(
+    quality = DrapeQuality(
         float(areas.min()), float(areas.max()), p99, inside, cut, drape.frames, drape.motion_mm, tuple(reasons)
     )
+    return quality, cuts
 
 
 def inside_parts(

@@ -1,8 +1,9 @@
 """Cloth at rest on a still body: a small-step solver in one compiled loop.
 
-Every substep predicts, pulls the cloth towards where the garment is held, bends, stretches, and resolves contact with
-friction, constraint by constraint, once. Short substeps stand for iterations: the sag of a sheet that is not solved to
-the end goes with the square of the step, and at 1/360 s edges around the armholes stay stretched by half.
+Every substep predicts, pulls the cloth towards where the garment is held, resolves contact with friction, bends, and
+stretches, constraint by constraint, once. Edges come last: contact would leave faces crushed where the body is creased.
+Short substeps stand for iterations: the sag of a sheet that is not solved to the end goes with the square of the step,
+and at 1/360 s edges around the armholes stay stretched by half.
 
 Left and right are treated alike: a constraint is followed by its mirror image, so that the mirror image of a pose gives
 the mirror image of the drape as far as rounding and the constraints across the middle allow.
@@ -44,16 +45,17 @@ class Sheet:
     """(E, 2) int32."""
     lengths: np.ndarray
     """(E,) at rest, on the pattern."""
-    edge_compliance: float
-    """Metres per newton."""
-    strain_limit: float
-    """Beyond this share of its length an edge does not give at all."""
+    edge_firmness: np.ndarray
+    """(E, 3) kilograms: by how much of its excess a stretched edge is corrected in a substep, one beyond the limits,
+    and a compressed one, over the inverse mass of each end."""
+    strain_limits: tuple[float, float]
+    """Beyond these shares of its length an edge does not give at all."""
     hinges: np.ndarray
     """(Q, 4) int32: the ends of an inner edge, then the vertices opposite."""
     hinge_weights: np.ndarray
     """(Q, 4) bending stencils."""
-    hinge_compliance: np.ndarray
-    """(Q,)."""
+    hinge_moves: np.ndarray
+    """(Q, 4) how far each vertex is moved in a substep, over the stencil's value."""
     inverse_masses: np.ndarray
     """(V,), 0 for a vertex that is pinned."""
     areas: np.ndarray
@@ -72,16 +74,23 @@ class Sheet:
         inverse_masses = 1 / (cloth.density * shares)
         inverse_masses[pinned] = 0.0
         edge_order, hinge_order = _by_sides(edges, mesh.mirror), _by_sides(stencils[:, :2], mesh.mirror)
-        stencils = stencils[hinge_order]
+        edges, lengths = edges[edge_order], lengths[edge_order]
+        both = inverse_masses[edges].sum(axis=1)
+        gives = 1 / (np.array([cloth.stretch_stiffness, np.inf, cloth.compression_stiffness]) * SUBSTEP_S**2)
+        firmness = 1 / np.maximum(both[:, None] + gives, 1e-9)
+        firmness[both == 0] = 0
+        stencils, weights = stencils[hinge_order], weights[hinge_order, :4]
+        # Energy of a hinge: 3 k / (A1 + A2) times half the squared stencil; A from the faces around its corners.
+        hinge_give = 2 * around[stencils].mean(axis=1) / (3 * cloth.bending) / SUBSTEP_S**2
+        pulled = weights * inverse_masses[stencils]
         return Sheet(
-            edges=np.ascontiguousarray(edges[edge_order], np.int32),
-            lengths=lengths[edge_order],
-            edge_compliance=1 / cloth.stretch_stiffness,
-            strain_limit=cloth.strain_limit,
+            edges=np.ascontiguousarray(edges, np.int32),
+            lengths=lengths,
+            edge_firmness=firmness,
+            strain_limits=(cloth.compression_limit, cloth.strain_limit),
             hinges=np.ascontiguousarray(stencils, np.int32),
-            hinge_weights=np.ascontiguousarray(weights[hinge_order, :4]),
-            # Energy of a hinge: 3 k / (A1 + A2) times half the squared stencil; A from the faces around its corners.
-            hinge_compliance=2 * around[stencils].mean(axis=1) / (3 * cloth.bending),
+            hinge_weights=np.ascontiguousarray(weights),
+            hinge_moves=pulled / ((weights * pulled).sum(axis=1) + hinge_give)[:, None],
             inverse_masses=inverse_masses,
             areas=areas,
             friction=cloth.friction,
@@ -132,11 +141,11 @@ def advance(
         sheet.inverse_masses,
         sheet.edges,
         sheet.lengths,
-        sheet.edge_compliance / SUBSTEP_S**2,
-        sheet.strain_limit,
+        sheet.edge_firmness,
+        *sheet.strain_limits,
         sheet.hinges,
         sheet.hinge_weights,
-        sheet.hinge_compliance / SUBSTEP_S**2,
+        sheet.hinge_moves,
         *hold,
         planes.vertices,
         planes.points,
@@ -155,11 +164,12 @@ def _advance(
     inverse_mass,
     edges,
     lengths,
-    edge_give,
-    strain_limit,
+    firmness,
+    shortest,
+    longest,
     hinges,
     weights,
-    hinge_give,
+    moves,
     held_at,
     held,
     touching,
@@ -180,8 +190,6 @@ def _advance(
                 before[i, k] = x[i, k]
                 x[i, k] += h * velocity[i, k]
                 x[i, k] += held[i] * (held_at[i, k] - x[i, k])
-        _bend(x, inverse_mass, hinges, weights, hinge_give, substep % 2 == 0)
-        _stretch(x, inverse_mass, edges, lengths, edge_give, strain_limit, substep % 2 == 0)
         for c in range(len(touching)):
             i = touching[c]
             nx, ny, nz = plane_normals[c, 0], plane_normals[c, 1], plane_normals[c, 2]
@@ -204,6 +212,8 @@ def _advance(
                 x[i, 0] -= stuck * tx
                 x[i, 1] -= stuck * ty
                 x[i, 2] -= stuck * tz
+        _bend(x, hinges, weights, moves, substep % 2 == 0)
+        _stretch(x, inverse_mass, edges, lengths, firmness, shortest, longest, substep % 2 == 0)
         for i in range(len(x)):
             dx, dy, dz = x[i, 0] - before[i, 0], x[i, 1] - before[i, 1], x[i, 2] - before[i, 2]
             gain = keep / h * min(1.0, FARTHEST_M / (np.sqrt(dx * dx + dy * dy + dz * dz) + 1e-12))
@@ -211,35 +221,33 @@ def _advance(
 
 
 @njit(cache=True, fastmath=True, nogil=True, inline="always")
-def _bend(x, inverse_mass, hinges, weights, give, forward):
+def _bend(x, hinges, weights, moves, forward):
     for q in range(len(hinges)):
         e = q if forward else len(hinges) - 1 - q
         a, b, c, d = hinges[e, 0], hinges[e, 1], hinges[e, 2], hinges[e, 3]
         wa, wb, wc, wd = weights[e, 0], weights[e, 1], weights[e, 2], weights[e, 3]
-        ma, mb, mc, md = inverse_mass[a], inverse_mass[b], inverse_mass[c], inverse_mass[d]
-        resistance = wa * wa * ma + wb * wb * mb + wc * wc * mc + wd * wd * md + give[e]
+        ma, mb, mc, md = moves[e, 0], moves[e, 1], moves[e, 2], moves[e, 3]
         for k in range(3):
-            bent = (wa * x[a, k] + wb * x[b, k] + wc * x[c, k] + wd * x[d, k]) / resistance
-            x[a, k] -= wa * ma * bent
-            x[b, k] -= wb * mb * bent
-            x[c, k] -= wc * mc * bent
-            x[d, k] -= wd * md * bent
+            bent = wa * x[a, k] + wb * x[b, k] + wc * x[c, k] + wd * x[d, k]
+            x[a, k] -= ma * bent
+            x[b, k] -= mb * bent
+            x[c, k] -= mc * bent
+            x[d, k] -= md * bent
 
 
 @njit(cache=True, fastmath=True, nogil=True, inline="always")
-def _stretch(x, inverse_mass, edges, lengths, give, limit, forward):
+def _stretch(x, inverse_mass, edges, lengths, firmness, shortest, longest, forward):
     for q in range(len(edges)):
         e = q if forward else len(edges) - 1 - q
         i, j = edges[e, 0], edges[e, 1]
         mi, mj = inverse_mass[i], inverse_mass[j]
-        if mi + mj == 0.0:
-            continue
         dx, dy, dz = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
         size = np.sqrt(dx * dx + dy * dy + dz * dz) + 1e-9
-        move = (size - lengths[e]) / (mi + mj + give)
-        if size > limit * lengths[e]:
-            move = max(move, (size - limit * lengths[e]) / (mi + mj))
-        move /= size
+        length = lengths[e]
+        if size > length:
+            move = max((size - length) * firmness[e, 0], (size - longest * length) * firmness[e, 1]) / size
+        else:
+            move = min((size - length) * firmness[e, 2], (size - shortest * length) * firmness[e, 1]) / size
         x[i, 0] += mi * move * dx
         x[i, 1] += mi * move * dy
         x[i, 2] += mi * move * dz

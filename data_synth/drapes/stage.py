@@ -39,7 +39,7 @@ from data_synth.drapes.quality import DrapeQuality, measure_drape
 
 __all__ = ["run", "split_drapes"]
 
-SCHEMA = 1
+SCHEMA = 2
 MEASURES = tuple(each.name for each in fields(DrapeQuality) if each.name != "reasons")
 
 
@@ -120,7 +120,7 @@ def _draper(config: DrapesConfig) -> Draper:
 def _drape(draper: Draper, job: _Job) -> None:
     """Draw, drape and measure the poses of a shard, and write them."""
     config, limbs = job.config, GARMENTS[job.config.garment].limbs
-    poses, vertices, quality, drawn = [], [], [], []
+    poses, vertices, quality, cuts, drawn = [], [], [], [], []
     for number in range(job.first, job.last):
         rng = np.random.default_rng([config.seed, 0, number])
         rotations, count = draw_pose(draper.person, limbs, config.poses, rng)
@@ -128,7 +128,9 @@ def _drape(draper: Draper, job: _Job) -> None:
         poses.append(rotations)
         drawn.append(count)
         vertices.append(drape.vertices)
-        quality.append(measure_drape(draper, rotations, drape))
+        measured, cut = measure_drape(draper, rotations, drape)
+        quality.append(measured)
+        cuts.append(cut)
     count = len(quality)
     write_npz(
         job.path,
@@ -139,6 +141,7 @@ def _drape(draper: Draper, job: _Job) -> None:
         vertices=np.array(vertices, np.float32),
         kept=np.array([not each.reasons for each in quality]),
         quality=np.array([[getattr(each, name) for name in MEASURES] for each in quality], np.float64),
+        cuts=np.packbits(cuts, axis=1),
         drawn=np.array(drawn, np.int32),
         reasons=np.array(["; ".join(each.reasons) for each in quality]),
     )

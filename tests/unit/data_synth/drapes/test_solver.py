@@ -91,3 +91,29 @@ def test_stiffer_cloth_bends_less():
     ]
     assert 1.3 * reach[0] < reach[1]
     assert 1.3 * reach[1] < reach[2]
+
+
+def test_cloth_gives_way_in_compression_as_a_bar_of_two_stiffnesses():
+    """A flat strip held at both ends hangs on the upper one by the root of the share of stiffness in compression:
+    N = w L / (1 + sqrt(c)), and sags by N^2 / (2 Y w)."""
+    mesh = strip()
+    start = flat(mesh)
+    ends = np.flatnonzero(np.abs(start[:, 1] + 0.15) > 0.15 - 1e-9)
+    sags = []
+    for share in (1.0, 0.25):
+        cloth = Cloth(
+            stretch_stiffness=10.0, compression_stiffness=10.0 * share, strain_limit=2.0, compression_limit=0.0
+        )
+        end = run(Sheet.create(mesh, cloth, ends), start, NOTHING, frames=60)
+        assert np.abs(end[:, 2]).max() < 1e-9
+        sags.append((start - end)[np.abs(start[:, 0]) < 0.02, 1].max())
+    assert sags[1] / sags[0] == pytest.approx((2 / (1 + 0.25**0.5)) ** 2, rel=0.1)
+
+
+def test_an_edge_is_hardly_shorter_than_its_limit():
+    mesh = strip()
+    start = flat(mesh) * (1.0, 0.7, 1.0)
+    sheet = Sheet.create(mesh, Cloth(compression_stiffness=1e-3), np.flatnonzero(start[:, 1] > -1e-9))
+    end = run(sheet, start, NOTHING, frames=4)
+    lengths = np.linalg.norm(end[sheet.edges[:, 1]] - end[sheet.edges[:, 0]], axis=1)
+    assert (lengths / sheet.lengths).min() > 0.75

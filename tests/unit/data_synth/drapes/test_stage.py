@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from capture4d.app.report.drapes import angle_charts, read_set, write_page
 from capture4d.body.skinning import ShapedBody
 from capture4d.errors import InputError, StaleError
 from capture4d.files.records import load_body, load_garment
@@ -43,6 +44,12 @@ def test_a_set_has_everything_that_a_learner_needs(tmp_path: Path):
     assert sorted(numbered) == [1, 2, 3, 4, 5]
     assert set(split["pruned"]) == {str(number) for number in result.failed}
     assert len((tmp_path / "quality.jsonl").read_text().splitlines()) == 5
+    drapes = read_set(tmp_path)
+    np.testing.assert_allclose(100 * drapes.cuts.mean(axis=1), drapes.quality["cut_percent"], atol=1e-9)
+    np.testing.assert_array_equal(drapes.kept, [not reasons for reasons in drapes.reasons])
+    page = write_page(tmp_path).read_text()
+    assert "Drapes of a necktie" in page
+    assert page.count("<svg") == len(angle_charts(drapes)) > 0
 
 
 def test_what_a_kill_left_is_finished_to_the_same_bytes(tmp_path: Path):
