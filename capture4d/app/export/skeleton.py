@@ -38,7 +38,8 @@ class Skeleton:
             poses: of the frames that are exported, in their order.
         """
         cut = four_influences(skin_weights)
-        parents, wanted = person.body.parents, cut.any(axis=0)
+        parents = person.body.parents
+        wanted: np.ndarray = np.asarray(cut.max(axis=0) > 0)
         for joint in range(len(parents) - 1, 0, -1):
             wanted[parents[joint]] |= wanted[joint]
         wanted[0] = True

@@ -98,7 +98,7 @@ def _have_same_faces(found: Mesh, template: Mesh) -> bool:
     """Whichever corner comes first, and in whatever order the faces are."""
     if len(found.faces) != len(template.faces):
         return False
-    return np.array_equal(*(_canonical(mesh.faces) for mesh in (found, template)))
+    return np.array_equal(_canonical(found.faces), _canonical(template.faces))
 
 
 def _canonical(faces: np.ndarray) -> np.ndarray:

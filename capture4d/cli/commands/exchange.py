@@ -53,7 +53,7 @@ class Export(_Alone):
 
         if self.all and self.format:
             raise CommandLineError("--all: expected to be without --format, found both")
-        formats = list(dict.fromkeys(self.format))
+        formats: list[Format] = [*dict.fromkeys(self.format)]
         if self.all:
             formats, left_out = possible_formats(FORMATS)
             for line in left_out:

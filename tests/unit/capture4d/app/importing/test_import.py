@@ -62,8 +62,8 @@ def test_what_does_not_fit_is_one_line(
     mesh = cloth()
     write_mesh(tmp_path / "other.ply", Mesh(mesh.vertices[::-1].copy(), mesh.faces))
     write_mesh(tmp_path / "turned.ply", Mesh(mesh.vertices, mesh.faces[:, ::-1].copy()))
+    write_mesh(tmp_path / "few.ply", Mesh(mesh.vertices[: 3 * len(mesh.vertices) // 4], np.zeros((1, 3), np.int32)))
     for name in ("other.ply", "turned.ply"):
-        write_mesh(tmp_path / "few.ply", Mesh(mesh.vertices[: 3 * len(mesh.vertices) // 4], np.zeros((1, 3), np.int32)))
         given[3] = tmp_path / name
         code = run(*given, "--fps", 50, "--quiet", "--overwrite")
         said = capsys.readouterr().err
