@@ -74,6 +74,7 @@ from data_synth.mesh_sequence import open_sequence
 from retarget.shapes.files import load_blendshapes, save_blendshapes
 from wrinkles.normal_maps.pair_files import read_map
 from wrinkles.normal_maps.spaces import encode_png
+from wrinkles.offset_images.editing.operations import read_operations
 
 __all__ = ["BY_NAME", "KINDS", "Kind", "fault_of", "laid_out", "whole"]
 
@@ -307,6 +308,9 @@ KINDS = [
     Kind("vertices.npy", lambda path: write_npy(path, RNG.random((4, 6, 3), np.float32)), map_array),
     Kind("labels.npy", lambda path: write_npy(path, RNG.integers(0, 9, 12)), read_cage),
     Kind("cage.json", lambda path: write_json(path, {"curves": [[0, 3, 5], [1, 2]]}), read_cage),
+    Kind("operations.json", lambda path: write_json(path, {"operations": [
+        {"do": "paint", "height_cm": 1.5, "stroke": [[0.5, 0.5]]}, {"do": "transfer", "from": "other"}]}),
+         read_operations),
     Kind("map.png", _normal_map, read_map),
     Kind("board.png", _board_image, _detect),
     Kind("registration/frames/000001.npz", _registration, _read_registration, names_other=True),

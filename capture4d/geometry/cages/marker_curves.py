@@ -17,6 +17,7 @@ and no method.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float, Float64, Integer
@@ -100,9 +101,9 @@ def curve_through(
     nudge = NUDGE * np.sqrt(6 * slack) * signs * _across(normalised(np.diff(knots, axis=0)), bow)
     for weight in WEIGHTS:
         found = least_squares(
-            lambda free, w=weight: segments.residuals(free, w),
+            partial(segments.residuals, weight=weight),
             (tangents + nudge).ravel(),
-            jac=lambda free, w=weight: segments.jacobian(free, w),  # type: ignore[arg-type]
+            jac=partial(segments.jacobian, weight=weight),
             max_nfev=40,
         )
         tangents = found.x.reshape(-1, 3)

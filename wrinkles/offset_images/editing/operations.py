@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, assert_never
 
 import numpy as np
@@ -16,9 +17,11 @@ from jaxtyping import Bool, Float, Float32, Float64
 from scipy.ndimage import gaussian_filter
 
 from capture4d.errors import InputError
+from capture4d.files.atomic import read_json
 from capture4d.files.json_values import number, text
+from capture4d.files.reading import reading
 
-__all__ = ["Operation", "apply_operation", "parse_operations"]
+__all__ = ["Operation", "apply_operation", "parse_operations", "read_operations"]
 
 Kind = Literal["shift", "inflate", "paint", "transfer"]
 SIDES = {"front": (0,), "back": (1,), "both": (0, 1)}
@@ -45,6 +48,16 @@ class Operation:
     """Of the brush, as a share of the picture's side: there its effect is 1/e."""
     source: str = ""
     """Folder of the image whose wrinkles are transferred."""
+
+
+def read_operations(path: Path) -> list[Operation]:
+    """`parse_operations` of a JSON file.
+
+    Raises:
+        InputError: the file is missing, damaged, or says something else.
+    """
+    with reading(path, "file of operations"):
+        return parse_operations(read_json(path))
 
 
 def parse_operations(tree: Mapping[str, Any]) -> list[Operation]:

@@ -31,7 +31,7 @@ from capture4d.geometry.mesh import edge_lengths, unique_edges
 from capture4d.types import Mesh
 from wrinkles.offset_images.editing.changes import changed_vertices
 from wrinkles.offset_images.editing.config import ApplyEditsConfig, DrawConfig, PictureFormat
-from wrinkles.offset_images.editing.operations import apply_operation, parse_operations
+from wrinkles.offset_images.editing.operations import apply_operation, read_operations
 from wrinkles.offset_images.editing.picture_files import RANGE_CM, read_change, write_picture
 from wrinkles.offset_images.layout import OffsetLayout, encode
 
@@ -108,9 +108,7 @@ def edit(drawn: Path, operations: Path, work: WorkFolder, output: Path) -> None:
     Raises:
         InputError: an operation is unknown, or a folder is damaged or of another take or size.
     """
-    with reading(operations, "file of operations"):
-        tree = read_json(operations)
-        wanted = parse_operations(tree)
+    wanted = read_operations(operations)
     found = _read(drawn)
     layout, _, _ = _frame(work, whole(found.notes["frame"], "frame"), whole(found.notes["texels"], "texels"))
     images = found.images
@@ -125,7 +123,7 @@ def edit(drawn: Path, operations: Path, work: WorkFolder, output: Path) -> None:
     for side, name in enumerate(SIDES):
         write_picture(output / f"{name}.{found.kind}", images[..., 3 * side : 3 * side + 3], found.kind)
     shutil.copyfile(drawn / OFFSETS, output / OFFSETS)
-    done = [*found.notes.get("operations", []), *tree["operations"]]
+    done = [*found.notes.get("operations", []), *read_json(operations)["operations"]]
     write_json(output / LAYOUT, found.notes | {"operations": done})
 
 

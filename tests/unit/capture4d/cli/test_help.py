@@ -85,7 +85,19 @@ def test_examples_are_understood(name: str):
         parse(name, COMMANDS[name], rest, _PRESETS.get(COMMANDS[name]))
 
 
-QUICK = {"template", "register-mesh", "convert-body", "convert-rig", "convert-poses", "doctor", "status", "diff"}
+QUICK = {
+    "offsets draw",
+    "offsets edit",
+    "offsets apply",
+    "template",
+    "register-mesh",
+    "convert-body",
+    "convert-rig",
+    "convert-poses",
+    "doctor",
+    "status",
+    "diff",
+}
 """Commands that show no progress."""
 
 
