@@ -57,7 +57,7 @@ class MeshRegistration:
     quality: FrameQuality
     """Judged on the normalised problem; all its lengths, those in `reasons` too, are of the files' world."""
     way: str = ""
-    """Which attempt counts: near, far, wide, or soft (`registration.mesh_fit`)."""
+    """Which attempt counts: near, far, wide, sized, or soft (`registration.mesh_fit`)."""
     estimated: bool = False
     """The scan came as points alone; its faces are made between them."""
     floor_percent: float = 0.0
