@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 from scipy.linalg import cho_factor, cho_solve
 
-__all__ = ["likeness", "ridge_answers"]
+__all__ = ["left_out_errors", "likeness", "ridge_answers"]
 
 
 def likeness(
@@ -52,3 +52,14 @@ def ridge_answers(
     for ridge in ridges:
         factor = cho_factor(alike + ridge * np.eye(len(alike)), check_finite=False)
         yield cho_solve(factor, wanted, check_finite=False)
+
+
+def left_out_errors(
+    alike: Float64[np.ndarray, "learned learned"], wanted: Float64[np.ndarray, "learned outputs"], ridge: float
+) -> Float64[np.ndarray, "learned outputs"]:
+    """How far off each learned row is foretold by a regression on all the others, exactly and without fitting them.
+
+    References: Rasmussen and Williams, section 5.4.2, equation 5.12.
+    """
+    inverse = cho_solve(cho_factor(alike + ridge * np.eye(len(alike))), np.eye(len(alike)))
+    return (inverse @ wanted) / np.diag(inverse)[:, None]

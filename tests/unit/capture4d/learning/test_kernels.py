@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from capture4d.learning.kernels import likeness, ridge_answers
+from capture4d.learning.kernels import left_out_errors, likeness, ridge_answers
 
 
 def test_likeness_is_the_sum_of_its_kernels() -> None:
@@ -26,3 +26,14 @@ def test_a_small_ridge_gives_back_what_was_learned_and_a_large_one_nothing() -> 
     np.testing.assert_allclose(alike @ small, wanted, atol=1e-6)
     np.testing.assert_allclose(middle, np.linalg.solve(alike + 0.3 * np.eye(12), wanted))
     assert np.abs(alike @ large).max() < 1e-6
+
+
+def test_rows_left_out_are_foretold_as_by_a_regression_on_the_others():
+    rng = np.random.default_rng(5)
+    points, wanted = rng.normal(size=(9, 2)), rng.normal(size=(9, 3))
+    alike = likeness([points], [points], np.ones(1), 0.5)
+    off = left_out_errors(alike, wanted, 0.1)
+    for row in range(9):
+        others = np.arange(9) != row
+        (answers,) = ridge_answers(alike[np.ix_(others, others)], wanted[others], (0.1,))
+        np.testing.assert_allclose(off[row], wanted[row] - alike[row, others] @ answers, atol=1e-10)
