@@ -24,6 +24,7 @@ _GROUPS: Mapping[str, Sequence[str]] = {
     ),
     "learn and animate:": (
         "fit", "animate", "wrinkles maps", "wrinkles train", "wrinkles apply", "wrinkles offsets", "compare",
+        "offsets train", "offsets predict",
     ),
     "two meshes:": ("register-mesh",),
     "rigs:": ("calibrate", "check-rig", "convert-rig", "synth-board"),
@@ -66,6 +67,11 @@ EXAMPLES: Mapping[str, Sequence[str]] = {
     "wrinkles train": ("wrinkles train work --output model",),
     "wrinkles apply": ("wrinkles apply model work --bits 8 --flip-green",),
     "wrinkles offsets": ("wrinkles offsets work",),
+    "offsets train": (
+        "offsets train drapes --output model",
+        "offsets train ties --output tie --preset necktie",
+    ),
+    "offsets predict": ("offsets predict model --poses motion.npz --output dance",),
     "compare": ("compare work --model model",),
     "register-mesh": ("register-mesh template.obj scan.ply --output fitted.ply --border-colour ffd200",),
     "calibrate": ("calibrate images --board charuco:14x10:60:44:DICT_5X5_100 --output rig.json",),

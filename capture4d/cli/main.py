@@ -23,6 +23,7 @@ from capture4d.cli.commands.doctor import Doctor
 from capture4d.cli.commands.files import ConvertBody, ConvertPoses, ConvertRig, RegisterMesh, Template
 from capture4d.cli.commands.folders import Diff, Status
 from capture4d.cli.commands.models import Animate, Fit
+from capture4d.cli.commands.offsets import OffsetsPredict, OffsetsTrain
 from capture4d.cli.commands.stages import Extract, Register, Report, Run, Track
 from capture4d.cli.commands.synthesis import Demo, Scan, Synth, SynthBoard, SynthDrapes
 from capture4d.cli.commands.wrinkles import Compare, WrinklesApply, WrinklesMaps, WrinklesOffsets, WrinklesTrain
@@ -34,6 +35,7 @@ from capture4d.runs.address_space import require_address_space
 from data_synth import config as synth_config
 from registration import config as registration_config
 from wrinkles.normal_maps import config as wrinkle_config
+from wrinkles.offset_images import config as offset_config
 
 __all__ = ["COMMANDS", "main"]
 
@@ -61,6 +63,8 @@ COMMANDS: Mapping[str, Any] = {
     "wrinkles train": WrinklesTrain,
     "wrinkles apply": WrinklesApply,
     "wrinkles offsets": WrinklesOffsets,
+    "offsets train": OffsetsTrain,
+    "offsets predict": OffsetsPredict,
     "compare": Compare,
     "register-mesh": RegisterMesh,
     "calibrate": Calibrate,
@@ -80,6 +84,7 @@ _PRESETS: Mapping[Any, Mapping[str, Any]] = {
     Register: registration_config.PRESETS,
     Run: registration_config.PRESETS,
     WrinklesTrain: wrinkle_config.PRESETS,
+    OffsetsTrain: offset_config.PRESETS,
 }
 
 

@@ -22,7 +22,7 @@ from capture4d.settings import (
 
 __all__ = ["PRESETS", "DrapeOffsetsConfig", "OffsetConfig", "OffsetTrainingConfig", "PatchConfig", "StripConfig"]
 
-Texels = Annotated[int, Range(least=16), PowerOfTwo]
+Texels = Annotated[int, Range(least=16, most=1024), PowerOfTwo]
 Eights = Condition(lambda number: number % 8 == 0, "a multiple of 8")
 
 

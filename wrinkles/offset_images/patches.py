@@ -94,6 +94,8 @@ def strip_window(layout: OffsetLayout, rows: int, columns: int, padding: int) ->
     Raises:
         InputError: the garment lies in both images, or is wider or longer than the strip.
     """
+    if max(rows, columns) > layout.size:
+        raise InputError(f"expected images as long as a strip of {rows} x {columns} texels, found {layout.size}")
     if len(images := np.unique(layout.image)) > 1:
         raise InputError("expected a garment that lies in one image, such as a necktie, found one with front and back")
     faces = np.ones(len(layout.faces), bool)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -60,7 +61,7 @@ def read_drape_parts(folder: Path, drapes: DrapeSet) -> DrapeParts:
     return DrapeParts(rows["train"], rows["validation"], rows["test"], joints, mirror)
 
 
-def _rows(drapes: DrapeSet, numbers: list[int]) -> Int64[np.ndarray, " rows"]:
+def _rows(drapes: DrapeSet, numbers: Sequence[int]) -> Int64[np.ndarray, " rows"]:
     wanted = np.array(numbers, np.int64)
     rows = np.searchsorted(drapes.numbers, wanted)
     if (rows >= len(drapes.numbers)).any() or (drapes.numbers[rows] != wanted).any():
