@@ -98,7 +98,7 @@ def test_a_bending_sleeve_is_learned(drapes: Path, tmp_path: Path, network: str)
     config = DrapeOffsetsConfig(
         network="pca", texels=32, components=4, mirrored=False, residual=network == "over kernels",
         partner=network == "with kernels",
-        training=OffsetTrainingConfig(epochs=40 if network == "direct" else 100, batch=4, half_precision=False),
+        training=OffsetTrainingConfig(epochs=100, patience=100, batch=8, half_precision=False),
     )  # fmt: skip
     if network in ("direct", "kernels"):
         config = replace(config, network=network)  # pyright: ignore
