@@ -58,7 +58,7 @@ def run(
 
     Args:
         quick: nine frames of a small take to learn, three to test; images of 64 texels are learned, 256 measured. Of
-            drapes 80, about 50 of which are kept.
+            drapes 60, of which 37 are kept.
         data: drapes are of a T-shirt, 5,000 of them, and are learned in parts that a second run takes over.
         train, test: work folders of one garment and subject; none: the clips of `tshirt-train`, registered from their
             scans with tracked bodies, and its held-out ones. Of several to learn from the last one chooses the epoch,
@@ -67,7 +67,7 @@ def run(
         epochs, baseline_epochs: of the decoder, and of the baselines, whose epochs take a second.
     """
     if quick:
-        epochs, baseline_epochs = 40 if data == "drapes" else 60, 60
+        epochs, baseline_epochs = 60, 60
     if data == "drapes":
         if test or len(train) > 1:
             raise InputError("benchmarks offsets: expected one set of drapes as --train, whose own part is the test")

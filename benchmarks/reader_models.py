@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.reader_values import BODY, GARMENT, MESH, NAMES, PARENTS, RNG
+from capture4d.types import Mesh
 
 __all__ = ["MODELS"]
 
