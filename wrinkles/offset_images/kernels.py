@@ -1,8 +1,8 @@
 """Offsets by kernel regression on poses: a baseline, a partner, and a first guess that a decoder adds to.
 
-Each frame that was learned from counts as much as its pose is like the one that is asked for. With few hundred frames
-that is as good as any network (Jin et al. have none to compare with); it knows its own frames by heart, so a network
-that adds to it must learn from guesses of which the frame itself was left out. Those are exact here, and cost nothing.
+Each frame that was learned from counts as much as its pose is like the one that is asked for. Jin et al. have none to
+compare with; with few frames they are hard to beat. They know their own frames by heart, so a network that adds to them
+must learn from guesses of which the frame itself was left out. Those are exact here: they follow from the inverse.
 
 Letters: N frames, D numbers of a pose, K principal components of the offsets, P cloth pixels.
 

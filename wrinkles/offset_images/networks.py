@@ -111,7 +111,7 @@ class PcaFullyConnected(nn.Module):
     """The baseline with PCA: pose to coefficients of the offsets' principal components.
 
     It learns the coefficients themselves, all in units of the first one's standard deviation: a squared error of
-    coefficients is then one of offsets, and costs a thousandth of it.
+    coefficients is then one of offsets.
     """
 
     mean: Tensor
