@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -18,26 +19,22 @@ from torch import nn
 
 from benchmarks.learning_takes import learned_takes, registered_takes, training_set
 from benchmarks.metric import Metric
+from benchmarks.offset_drapes import drape_metrics
 from benchmarks.registered_work import QUICK_TAKE, registered_work
 from capture4d.body.skinning import with_shape
 from capture4d.captures.work_folder import load_records, load_registration, open_work
 from capture4d.errors import InputError
 from capture4d.learning.networks import ImageDecoder
 from retarget.shapes.pose_normalisation import PoseRows
+from wrinkles.offset_images.canvas import OffsetSampler
 from wrinkles.offset_images.config import OffsetTrainingConfig
-from wrinkles.offset_images.layout import OffsetLayout, OffsetSampler
+from wrinkles.offset_images.frames import OffsetFrames, joined_frames, offset_frames, pose_joints, vertex_errors_cm
+from wrinkles.offset_images.layout import OffsetLayout
 from wrinkles.offset_images.networks import FullyConnected, PcaFullyConnected
-from wrinkles.offset_images.training import (
-    OffsetFrames,
-    OffsetLesson,
-    offset_frames,
-    pose_joints,
-    predict,
-    train_offsets,
-    vertex_errors_cm,
-)
+from wrinkles.offset_images.training import OffsetLesson, predict, train_offsets
 
 CM_IN_MM = 10.0
+TEXELS, COMPONENTS = 256, 128
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,26 +46,46 @@ class _Errors:
 def run(
     *,
     quick: bool = False,
+    data: Literal["takes", "drapes"] = "takes",
     train: tuple[Path, ...] = (),
     test: tuple[Path, ...] = (),
-    size: int = 256,
+    folder: Path | None = None,
     epochs: int = 24,
     baseline_epochs: int = 120,
-    components: int = 128,
     workers: int = 2,
 ) -> list[Metric]:
-    """Train decoder and baselines on registered frames.
+    """Train decoder and baselines on registered frames, or on static drapes.
 
     Args:
-        quick: nine frames of a small take to learn, three to test; images of 64 texels are learned, 256 measured.
+        quick: nine frames of a small take to learn, three to test; images of 64 texels are learned, 256 measured. Of
+            drapes 60, of which 37 are kept.
+        data: drapes are of a T-shirt, 5,000 of them, and are learned in parts that a second run takes over.
         train, test: work folders of one garment and subject; none: the clips of `tshirt-train`, registered from their
             scans with tracked bodies, and its held-out ones. Of several to learn from the last one chooses the epoch,
-            of one its last ninth.
-        size: texels along the side of the images that are learned.
+            of one its last ninth. Of drapes: a set to learn instead of the T-shirt's, `train` alone.
+        folder: keeps what is learned of drapes.
         epochs, baseline_epochs: of the decoder, and of the baselines, whose epochs take a second.
     """
     if quick:
-        works, epochs, baseline_epochs, size = (registered_work(QUICK_TAKE, workers=workers)[1],), 60, 60, 64
+        epochs, baseline_epochs = 60, 60
+    if data == "drapes":
+        if test or len(train) > 1:
+            raise InputError("benchmarks offsets: expected one set of drapes as --train, whose own part is the test")
+        return drape_metrics(
+            quick=quick, drapes=train[0] if train else None, folder=folder, epochs=epochs,
+            baseline_epochs=baseline_epochs, workers=workers,
+        )  # fmt: skip
+    return _of_takes(
+        quick=quick, train=train, test=test, epochs=epochs, baseline_epochs=baseline_epochs, workers=workers
+    )
+
+
+def _of_takes(
+    *, quick: bool, train: tuple[Path, ...], test: tuple[Path, ...], epochs: int, baseline_epochs: int, workers: int
+) -> list[Metric]:
+    size = 64 if quick else TEXELS
+    if quick:
+        works: tuple[Path, ...] = (registered_work(QUICK_TAKE, workers=workers)[1],)
         tests: tuple[Path, ...] = works
     elif not (train or test):
         config, folder = training_set(quick=False, workers=workers)
@@ -90,9 +107,9 @@ def run(
         learned, tested = clips[0].rows(range(9)), clips[0].rows(range(9, 12))
         validation = tested
     else:
-        tested = _joined([_frames(layout, work, joints, good_only=True) for work in tests])
+        tested = joined_frames([_frames(layout, work, joints, good_only=True) for work in tests])
         if len(clips) > 1:
-            learned, validation = _joined(clips[:-1]), clips[-1]
+            learned, validation = joined_frames(clips[:-1]), clips[-1]
         else:
             cut = max(len(clips[0]) // 9, 1)  # the paper regularises on a ninth
             learned, validation = (clips[0].rows(part) for part in (range(len(clips[0]) - cut), range(-cut, 0)))
@@ -103,7 +120,7 @@ def run(
     networks = {
         "decoder": ImageDecoder(pose_size, channels=384 if size == 256 else 32, doublings=doublings),
         "fc": FullyConnected(pose_size, len(layout.vertex)),
-        "fc_pca": PcaFullyConnected.analysed(pose_size, learned.offsets, components=components),
+        "fc_pca": PcaFullyConnected.analysed(pose_size, learned.offsets, components=COMPONENTS),
     }
     lengths = {"decoder": epochs, "fc": baseline_epochs, "fc_pca": baseline_epochs}
     errors = {
@@ -138,11 +155,6 @@ def _frames(layout: OffsetLayout, work: Path, joints: np.ndarray, *, good_only: 
     frames = offset_frames(layout, body, rows.poses, np.array(sequence.vertices), joints)
     records = load_records(work / "registration")
     return frames.rows([row for row, each in enumerate(records) if each["verdict"] != "failed" or not good_only])
-
-
-def _joined(parts: list[OffsetFrames]) -> OffsetFrames:
-    names = OffsetFrames.__dataclass_fields__
-    return OffsetFrames(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})
 
 
 def _errors(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.reader_values import BODY, GARMENT, MESH, NAMES, PARENTS, RNG
+from capture4d.types import Mesh
 
 __all__ = ["MODELS"]
 
@@ -164,6 +166,27 @@ def _read_styles(path: Path) -> Any:
     return load_styled_garment(path.parent)
 
 
+def _write_drape_offsets(path: Path) -> None:
+    """A model of kernels; garment and body lie beside what is damaged."""
+    from wrinkles.offset_images.config import DrapeOffsetsConfig
+    from wrinkles.offset_images.drape_model import ModelParts, save_model_parts
+    from wrinkles.offset_images.kernels import PoseKernels
+
+    apart = np.arange(3, dtype=np.float32)[:, None, None] / 3  # a face is an island of three pixels
+    uv = apart + np.array([[0, 0], [0.25, 0], [0, 0.25]], np.float32)
+    garment = replace(GARMENT, template=Mesh(MESH.vertices, MESH.faces, uv))
+    kernels = PoseKernels(*(RNG.random(size, np.float32) for size in ((4, 18), (4, 2), (27,), (2, 27))), 1.0, 0.1)
+    config = DrapeOffsetsConfig(network="kernels", texels=64)
+    parts = ModelParts(config, garment, BODY, np.zeros(2, np.float32), NAMES[1:3], None, kernels, None)
+    save_model_parts(path.parent, parts)
+
+
+def _read_drape_offsets(path: Path) -> Any:
+    from wrinkles.offset_images.drape_model import load_drape_offsets
+
+    return load_drape_offsets(path.parent)
+
+
 MODELS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any]]] = {
     "linear": (_write_linear, _read_linear),
     "kernel": (_write_kernel, _read_kernel),
@@ -174,5 +197,6 @@ MODELS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any]]] = {
     "pca": (partial(_write_offsets, baseline=True), _read_offsets),
     "ensemble/styles": (partial(_write_styles, method="ensemble"), _read_styles),
     "mixture/styles": (partial(_write_styles, method="mixture"), _read_styles),
+    "drapes/model": (_write_drape_offsets, _read_drape_offsets),
 }
 """How a file of each is written, and read."""

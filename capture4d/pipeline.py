@@ -24,7 +24,7 @@ from capture4d.runs.decisions import forget_decisions, take_over_decisions
 from capture4d.runs.processes.pool import kept_workers
 from capture4d.runs.run_log import logged_stage
 from capture4d.runs.stage import StageResult
-from capture4d.synthetic import fit_styles, scan, synth, synth_board, synth_drapes
+from capture4d.synthetic import fit_styles, offsets_predict, offsets_train, scan, synth, synth_board, synth_drapes
 from capture4d.templates.config import TemplateConfig
 from capture4d.tracking.config import TrackingConfig
 from registration.config import MeshRegistrationConfig, RegistrationConfig
@@ -44,8 +44,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "animate", "calibrate", "check", "check_rig", "compare", "diff", "export", "extract", "fit", "fit_styles",
-    "import_meshes", "register", "register_mesh", "report", "run", "scan", "score", "status", "synth", "synth_board",
-    "synth_drapes", "template", "track",
+    "import_meshes", "offsets_predict", "offsets_train", "register", "register_mesh", "report", "run", "scan", "score",
+    "status", "synth", "synth_board", "synth_drapes", "template", "track",
     "wrinkles_apply", "wrinkles_maps", "wrinkles_offsets", "wrinkles_train",
 ]  # fmt: skip
 

@@ -14,8 +14,9 @@ from data_synth.drapes.config import DrapesConfig
 from data_synth.scanner.config import ScanConfig
 from data_synth.styles.config import STYLE_SETS, StyleSetConfig
 from retarget.mixture.config import StylesConfig
+from wrinkles.offset_images.config import DrapeOffsetsConfig
 
-__all__ = ["fit_styles", "scan", "synth", "synth_board", "synth_drapes"]
+__all__ = ["fit_styles", "offsets_predict", "offsets_train", "scan", "synth", "synth_board", "synth_drapes"]
 
 Place: TypeAlias = str | Path
 
@@ -43,6 +44,41 @@ def synth(
     if isinstance(config, SynthConfig):
         return stage(Path(output), config, workers=workers, overwrite=overwrite)
     return training_set(Path(output), config, workers=workers, overwrite=overwrite)
+
+
+@logged_stage("offsets train")
+def offsets_train(
+    drapes: Place,
+    output: Place,
+    config: DrapeOffsetsConfig | None = None,
+    *,
+    labels: Place | None = None,
+    workers: int = 1,
+    overwrite: bool = False,
+) -> StageResult:
+    """Learn a garment's offsets from the body from a set of drapes.
+
+    Args:
+        drapes: what `synth_drapes` wrote of one style on one person.
+        labels: a .npy with a whole number for each face of the garment: the patch it belongs to.
+        workers: torch's threads; the last bits of a network depend on their number.
+    """
+    from wrinkles.offset_images.train_stage import run as stage
+
+    given = None if labels is None else Path(labels)
+    return stage(
+        Path(drapes), Path(output), config or DrapeOffsetsConfig(), labels=given, workers=workers, overwrite=overwrite
+    )
+
+
+@logged_stage("offsets predict")
+def offsets_predict(
+    model: Place, poses: Place, output: Place, *, workers: int = 1, overwrite: bool = False
+) -> StageResult:
+    """Put what `offsets_train` learned on a motion: vertices.npy, metres."""
+    from wrinkles.offset_images.predict_stage import run as stage
+
+    return stage(Path(model), Path(poses), Path(output), workers=workers, overwrite=overwrite)
 
 
 @logged_stage("scan")

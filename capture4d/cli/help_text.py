@@ -24,7 +24,7 @@ _GROUPS: Mapping[str, Sequence[str]] = {
     ),
     "learn and animate:": (
         "fit", "fit-styles", "animate", "wrinkles maps", "wrinkles train", "wrinkles apply", "wrinkles offsets",
-        "compare", "offsets draw", "offsets edit", "offsets apply",
+        "compare", "offsets train", "offsets predict", "offsets draw", "offsets edit", "offsets apply",
     ),
     "out to other tools, and back:": ("export", "import", "score"),
     "two meshes:": ("register-mesh",),
@@ -75,6 +75,11 @@ EXAMPLES: Mapping[str, Sequence[str]] = {
     "wrinkles train": ("wrinkles train work --output model",),
     "wrinkles apply": ("wrinkles apply model work --bits 8 --flip-green",),
     "wrinkles offsets": ("wrinkles offsets work",),
+    "offsets train": (
+        "offsets train drapes --output model",
+        "offsets train ties --output tie --preset necktie",
+    ),
+    "offsets predict": ("offsets predict model --poses motion.npz --output dance",),
     "offsets draw": ("offsets draw work --frame 12 --output pictures",),
     "offsets edit": ("offsets edit pictures operations.json work --output edited",),
     "offsets apply": ("offsets apply edited work --output edited.ply",),

@@ -20,6 +20,7 @@ from typing import Any, NoReturn
 from capture4d.cli.answers import TerminatedError, answer_to, complain
 from capture4d.cli.commands.capture import Calibrate, Check, CheckRig
 from capture4d.cli.commands.doctor import Doctor
+from capture4d.cli.commands.drape_offsets import OffsetsPredict, OffsetsTrain
 from capture4d.cli.commands.exchange import Export, Import, Score
 from capture4d.cli.commands.files import ConvertBody, ConvertPoses, ConvertRig, RegisterMesh, Template
 from capture4d.cli.commands.folders import Diff, Status
@@ -37,6 +38,7 @@ from data_synth import config as synth_config
 from registration import config as registration_config
 from retarget.mixture import config as mixture_config
 from wrinkles.normal_maps import config as wrinkle_config
+from wrinkles.offset_images import config as offset_config
 
 __all__ = ["COMMANDS", "main"]
 
@@ -65,6 +67,8 @@ COMMANDS: Mapping[str, Any] = {
     "wrinkles train": WrinklesTrain,
     "wrinkles apply": WrinklesApply,
     "wrinkles offsets": WrinklesOffsets,
+    "offsets train": OffsetsTrain,
+    "offsets predict": OffsetsPredict,
     "offsets draw": OffsetsDraw,
     "offsets edit": OffsetsEdit,
     "offsets apply": OffsetsApply,
@@ -92,6 +96,7 @@ _PRESETS: Mapping[Any, Mapping[str, Any]] = {
     Run: registration_config.PRESETS,
     WrinklesTrain: wrinkle_config.PRESETS,
     FitStyles: mixture_config.PRESETS,
+    OffsetsTrain: offset_config.PRESETS,
 }
 
 

@@ -17,10 +17,7 @@ from dataclasses import dataclass
 from typing import Literal, assert_never
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Float32, Float64, Int32
-from torch import Tensor, nn
-from torch.nn import functional
 
 from capture4d.body.skinning import PosedBody
 from capture4d.errors import InputError
@@ -30,7 +27,7 @@ from capture4d.geometry.uv_layout import pack_islands, require_uvs
 from capture4d.geometry.uv_raster import UvRaster, rasterise_uv, sample_bilinear
 from capture4d.types import Garment, Mesh
 
-__all__ = ["Anchors", "OffsetLayout", "OffsetSampler", "OffsetSpace", "decode", "encode"]
+__all__ = ["Anchors", "OffsetLayout", "OffsetSpace", "decode", "encode"]
 
 OffsetSpace = Literal["local", "body_local", "root_offset", "root_position"]
 AMBIGUOUS = 0.35
@@ -163,7 +160,8 @@ class OffsetLayout:
         return images
 
     def sample(self, images: Float[np.ndarray, "size size 6"]) -> Float32[np.ndarray, "P 3"]:
-        """Images at the pixels, interpolated bilinearly; what `OffsetSampler` does for batches of tensors."""
+        """Images at the pixels, interpolated bilinearly; `wrinkles.offset_images.canvas`
+        does it for batches."""
         front, back = (sample_bilinear(part, self.uv) for part in (images[..., :3], images[..., 3:]))
         return np.where((self.image == 0)[:, None], front, back)
 
@@ -177,43 +175,6 @@ class OffsetLayout:
         uses = np.maximum(np.bincount(self.vertex, minlength=count), 1)
         sums = [np.bincount(self.vertex, cloth[:, axis], minlength=count) for axis in range(3)]
         return np.stack(sums, axis=1) / uses[:, None]
-
-
-class OffsetSampler(nn.Module):
-    """Images back to cloth pixels and vertices, differentiable."""
-
-    grid: Tensor
-    vertex: Tensor
-    front: Tensor
-    uses: Tensor
-
-    def __init__(self, layout: OffsetLayout) -> None:
-        super().__init__()
-        places = torch.from_numpy(layout.uv)
-        grid = torch.stack([2 * places[:, 0] - 1, 1 - 2 * places[:, 1]], dim=1)
-        vertex, image = torch.from_numpy(layout.vertex).long(), torch.from_numpy(layout.image)
-        self.verts = len(layout.garment.template.vertices)
-        self.register_buffer("grid", grid)
-        self.register_buffer("vertex", vertex)
-        self.register_buffer("front", image == 0)
-        self.register_buffer("uses", torch.bincount(vertex, minlength=self.verts).clamp(min=1).float())
-
-    def forward(self, images: Float[Tensor, "B 6 size size"]) -> Float[Tensor, "B P 3"]:
-        """Values at the pixels, interpolated bilinearly."""
-        grid = self.grid[None, :, None].expand(len(images), -1, -1, -1)
-        front, back = (
-            functional.grid_sample(part, grid, align_corners=False, padding_mode="border")[..., 0]
-            for part in (images[:, :3], images[:, 3:])
-        )
-        return torch.where(self.front, front, back).transpose(1, 2)
-
-    def positions(
-        self, pixels: Float[Tensor, "B P 3"], points: Float[Tensor, "B P 3"], axes: Float[Tensor, "B P 3 3"]
-    ) -> Float[Tensor, "B V 3"]:
-        """Template vertices from offsets, in the unit of the offsets and points."""
-        cloth = points + torch.einsum("bpca,bpa->bpc", axes, pixels)
-        total = cloth.new_zeros(len(cloth), self.verts, 3).index_add_(1, self.vertex, cloth)
-        return total / self.uses[:, None]
 
 
 def _sides(mesh: Mesh, islands: np.ndarray) -> np.ndarray:

@@ -12,8 +12,6 @@ References: Jin et al., A pixel-based framework for data-driven clothing, SCA 20
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,16 +20,14 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Int
-from torch import Tensor
 
 from capture4d.captures.work_folder import WorkFolder
 from capture4d.errors import InputError
-from capture4d.files.atomic import write_bytes, write_json
-from capture4d.learning.checkpoints import read_checkpoint, write_checkpoint
-from capture4d.runs.progress import progress
+from capture4d.files.atomic import write_json
 from capture4d.runs.stage import Stage, StageResult, open_stage
 from wrinkles.frame_split import split_rows
-from wrinkles.offset_images.config import OffsetConfig, OffsetTrainingConfig
+from wrinkles.offset_images.config import OffsetConfig
+from wrinkles.offset_images.frames import offset_frames, pose_joints
 from wrinkles.offset_images.layout import OffsetLayout
 from wrinkles.offset_images.model_files import (
     BASELINE,
@@ -44,20 +40,12 @@ from wrinkles.offset_images.model_files import (
     save_offset_model,
 )
 from wrinkles.offset_images.networks import PcaFullyConnected, image_decoder
-from wrinkles.offset_images.training import (
-    OffsetLesson,
-    OffsetTraining,
-    offset_frames,
-    pose_joints,
-    start_training,
-    train_epoch,
-)
+from wrinkles.offset_images.resumable import METRICS, TrainingLog, train_resumably
+from wrinkles.offset_images.training import OffsetLesson, start_training
 
 __all__ = ["run"]
 
-SCHEMA = 1
-METRICS = "metrics.jsonl"
-KIND = "training of offset images"
+SCHEMA = 2
 COMMAND = "capture4d wrinkles offsets WORK"
 BATCHES, SMALLEST_BATCH = 8, 4
 """A short take is learned from in as many batches, unless they become too small for batch norm."""
@@ -145,90 +133,11 @@ def _learn(stage: Stage, lesson: OffsetLesson, joints: Int[np.ndarray, " joints"
         path = _model(stage, name)
         if not path.is_file():
             training = start_training(network, lesson, settings)
-            _train(stage, name, training, before, settings)
-            network.load_state_dict(training.best.state_dict())
-            save_offset_model(path, OffsetModel(network, joints, config.texels, _history(name, training)))
+            history = train_resumably(TrainingLog(stage.path, COMMAND, before), name, training, settings)
+            save_offset_model(path, OffsetModel(network, joints, config.texels, history))
         before += load_offset_model(path).history
-        _write_metrics(stage, before)
-
-
-def _train(
-    stage: Stage,
-    name: str,
-    training: OffsetTraining,
-    before: Sequence[Mapping[str, Any]],
-    config: OffsetTrainingConfig,
-) -> None:
-    """Go on to the last epoch.
-
-    Args:
-        before: rows of the log about the networks that learned before this one.
-    """
-    _resume(stage, name, training)
-    with progress(name.replace("_", " "), config.epochs, completed=len(training.errors)) as advance:
-        while not training.is_over(config):
-            train_epoch(training, config)
-            advance(1)
-            if len(training.errors) % config.checkpoint_every == 0 or training.is_over(config):
-                _write_metrics(stage, [*before, *_history(name, training)])
-                _save(stage, name, training)
+        TrainingLog(stage.path, COMMAND, before).write([])
 
 
 def _model(stage: Stage, name: str) -> Path:
     return stage.path / f"{name}.safetensors"
-
-
-def _checkpoints(stage: Stage, name: str) -> list[Path]:
-    """The oldest first."""
-    return sorted((stage.path / "checkpoints").glob(f"{name}-*.safetensors"))
-
-
-def _save(stage: Stage, name: str, training: OffsetTraining) -> None:
-    earlier = _checkpoints(stage, name)
-    path = stage.path / "checkpoints" / f"{name}-{len(training.errors):06d}.safetensors"
-    write_checkpoint(
-        path,
-        KIND,
-        modules={"network": training.network, "best": training.best},
-        optimisers={"network": training.optimizer},
-        tensors={"losses": _numbers(training.losses), "errors": _numbers(training.errors)},
-    )
-    for old in earlier:
-        if old != path:
-            old.unlink()
-
-
-def _resume(stage: Stage, name: str, training: OffsetTraining) -> None:
-    """Go on from the newest checkpoint, if there is one."""
-    paths = _checkpoints(stage, name)
-    if not paths:
-        return
-    tensors, _ = read_checkpoint(
-        paths[-1],
-        KIND,
-        modules={"network": training.network, "best": training.best},
-        optimisers={"network": training.optimizer},
-        command=COMMAND,
-    )
-    training.go_on_from(tensors["losses"].tolist(), tensors["errors"].tolist())
-
-
-def _numbers(values: Sequence[float]) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64)
-
-
-def _history(name: str, training: OffsetTraining) -> list[dict[str, Any]]:
-    """One row an epoch; null where a number is not finite, as JSON has it."""
-    return [
-        {
-            "network": name,
-            "epoch": epoch,
-            "loss": loss if math.isfinite(loss) else None,
-            "validation_cm": error if math.isfinite(error) else None,
-        }
-        for epoch, (loss, error) in enumerate(zip(training.losses, training.errors, strict=True), start=1)
-    ]
-
-
-def _write_metrics(stage: Stage, rows: Sequence[Mapping[str, Any]]) -> None:
-    write_bytes(stage.path / METRICS, "".join(json.dumps(row) + "\n" for row in rows).encode())

@@ -1,4 +1,4 @@
-"""Learning offsets from poses: frames, losses and one loop for the decoder and its baselines. Lengths in centimetres.
+"""Learning offsets from poses: one loop for decoders of images, of windows, and the baselines. Lengths in centimetres.
 
 References: Jin et al., A pixel-based framework for data-driven clothing, SCA 2020, sections 5.2 and 6.
 """
@@ -8,165 +8,52 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float16, Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from capture4d.body.skinning import pose_frame, with_shape
 from capture4d.learning.networks import ImageDecoder
-from capture4d.types import Body, PoseSequence
+from wrinkles.offset_images.canvas import Canvas, OffsetSampler, Window, drawn_values
 from wrinkles.offset_images.config import OffsetTrainingConfig
-from wrinkles.offset_images.layout import OffsetLayout, OffsetSampler, OffsetSpace, encode
-from wrinkles.offset_images.networks import FullyConnected
+from wrinkles.offset_images.frames import OffsetFrames, vertex_errors_cm
+from wrinkles.offset_images.layout import OffsetLayout
+from wrinkles.offset_images.losses import edge_length_loss, grid_loss, normal_loss
+from wrinkles.offset_images.networks import FullyConnected, PcaFullyConnected
 
 __all__ = [
-    "OffsetFrames",
     "OffsetLesson",
     "OffsetTraining",
-    "grid_loss",
-    "normal_loss",
-    "offset_frames",
-    "pose_joints",
     "predict",
+    "predicted_offsets",
     "start_training",
     "train_epoch",
     "train_offsets",
-    "vertex_errors_cm",
 ]
 
-CM = 100.0
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class OffsetFrames:
-    """Poses and what they shall give, one row a frame."""
-
-    pose: Float[Tensor, "frames pose"]
-    offsets: Float[Tensor, "frames P 3"]
-    points: Float[Tensor, "frames P 3"]
-    axes: Float[Tensor, "frames P 3 3"]
-    vertices: Float[Tensor, "frames V 3"]
-
-    def __len__(self) -> int:
-        return len(self.pose)
-
-    def rows(self, index: Tensor | Sequence[int]) -> OffsetFrames:
-        """Some of the frames."""
-        at = torch.as_tensor(index)
-        return OffsetFrames(self.pose[at], self.offsets[at], self.points[at], self.axes[at], self.vertices[at])
-
-
-def pose_joints(
-    poses: PoseSequence, skin_weights: Float[np.ndarray, "V joints"], *, count: int = 10
-) -> Int[np.ndarray, " count"]:
-    """The joints that move the garment most: by how much they turn, times what of the garment hangs on them.
-
-    The root is left out: offsets turn with the body.
-    """
-    mean = poses.rotations.mean(axis=0)
-    turn = np.linalg.norm(poses.rotations - mean, axis=(2, 3)).mean(axis=0)
-    rank = turn * skin_weights.sum(axis=0)
-    rank[0] = -1
-    return np.sort(np.argsort(-rank, kind="stable")[:count])
-
-
-def offset_frames(
-    layout: OffsetLayout,
-    body: Body,
-    poses: PoseSequence,
-    vertices: Float[np.ndarray, "frames V 3"],
-    joints: Int[np.ndarray, " joints"],
-    *,
-    space: OffsetSpace = "local",
-) -> OffsetFrames:
-    """Encode registered frames, whose poses are those of `poses`, row by row."""
-    shaped = with_shape(body, poses.shape)
-    offsets, points, axes = [], [], []
-    for row, placed in enumerate(vertices):
-        anchors = layout.anchors(pose_frame(shaped, poses, row), space)
-        offsets.append(CM * encode(anchors, placed[layout.vertex].astype(np.float64)))
-        points.append(CM * anchors.points)
-        axes.append(anchors.axes)
-
-    def stacked(arrays: list[np.ndarray]) -> Tensor:
-        return torch.from_numpy(np.stack(arrays).astype(np.float32))
-
-    pose = torch.from_numpy(np.ascontiguousarray(poses.rotations[:, joints]).reshape(len(vertices), -1))
-    return OffsetFrames(
-        pose, stacked(offsets), stacked(points), stacked(axes), CM * torch.from_numpy(np.array(vertices))
-    )
-
-
-def grid_loss(
-    made: Float[Tensor, "B 6 size size"],
-    truth: Float[Tensor, "B 6 size size"],
-    mask: Bool[Tensor, "2 size size"],
-    norm: Literal["l1", "l2"],
-) -> Float[Tensor, ""]:
-    """The mean over the texels of both images of the length of the difference."""
-    difference = (made - truth).unflatten(1, (2, 3))
-    length = difference.abs().sum(dim=2) if norm == "l1" else difference.norm(dim=2)
-    return (length * mask).sum() / (mask.sum() * len(made))
-
-
-def normal_loss(
-    made: Float[Tensor, "B V 3"], truth: Float[Tensor, "B V 3"], faces: Int[Tensor, "F 3"]
-) -> Float[Tensor, ""]:
-    """The mean over the vertices of 1 - cos of the angle between the normals."""
-    return (1 - (_vertex_normals(made, faces) * _vertex_normals(truth, faces)).sum(dim=-1)).mean()
-
-
-def _vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
-    corner, along, across = (vertices[:, faces[:, k]] for k in range(3))
-    vector = torch.linalg.cross(along - corner, across - corner)
-    total = torch.zeros_like(vertices)
-    for k in range(3):
-        total = total.index_add(1, faces[:, k], vector)
-    return nn.functional.normalize(total, dim=-1, eps=1e-12)
-
-
-def predict(network: nn.Module, sampler: OffsetSampler, frames: OffsetFrames) -> Float[Tensor, "frames V 3"]:
-    """Vertices that a network gives to poses, centimetres."""
+def predicted_offsets(
+    network: nn.Module, sampler: OffsetSampler, pose: Float[Tensor, "frames pose"]
+) -> Float[Tensor, "frames Q 3"]:
+    """Offsets of the sampler's cloth pixels that a network gives to poses, centimetres."""
     network.eval()
     parts = []
     with torch.inference_mode():
-        for rows in torch.arange(len(frames)).split(8):
-            part = frames.rows(rows)
-            made = network(part.pose)
-            pixels = sampler(made) if isinstance(network, ImageDecoder) else made
-            parts.append(sampler.positions(pixels, part.points, part.axes))
+        for part in pose.split(8):
+            made = network(part)
+            parts.append(sampler(made) if isinstance(network, ImageDecoder) else made)
     return torch.cat(parts)
 
 
-def vertex_errors_cm(made: Float[Tensor, "frames V 3"], truth: Float[Tensor, "frames V 3"]) -> float:
-    """Mean distance of a vertex from where it should be."""
-    return float((made - truth).norm(dim=-1).mean())
-
-
-def _drawn(layout: OffsetLayout, frames: OffsetFrames) -> Float16[Tensor, "frames 6 size size"]:
-    """The images of all frames, drawn once; half precision errs by 0.01 mm at 2 cm."""
-    images = torch.empty((len(frames), 6, *layout.mask.shape[:2]), dtype=torch.float16)
-    for image, offsets in zip(images, frames.offsets.numpy(), strict=True):
-        image.copy_(torch.from_numpy(layout.draw(offsets)).permute(2, 0, 1))
-    return images
-
-
-def _start_from_mean(network: nn.Module, train: OffsetFrames, drawn: Tensor | None) -> None:
-    """Let a network that has learned nothing yet give the mean of the frames, whatever the pose."""
-    with torch.no_grad():
-        if isinstance(network, ImageDecoder) and drawn is not None:
-            network.mean.copy_(drawn.mean(dim=0, dtype=torch.float32))
-        if isinstance(network, (ImageDecoder, FullyConnected)):
-            last = network.layers[-1]
-            assert isinstance(last, (nn.Conv2d, nn.Linear))
-            assert last.bias is not None
-            last.weight.zero_()
-            last.bias.zero_()
-            if isinstance(network, FullyConnected):
-                last.bias.copy_(train.offsets.mean(dim=0).flatten())
+def predict(network: nn.Module, sampler: OffsetSampler, frames: OffsetFrames) -> Float[Tensor, "frames V 3"]:
+    """The sampler's vertices that a network gives to poses, centimetres."""
+    made = predicted_offsets(network, sampler, frames.pose)
+    parts = []
+    for rows in torch.arange(len(frames)).split(8):
+        points, axes = (each[rows][:, sampler.pixels] for each in (frames.points, frames.axes))
+        parts.append(sampler.positions(made[rows], points, axes))
+    return torch.cat(parts)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -176,6 +63,10 @@ class OffsetLesson:
     layout: OffsetLayout
     train: OffsetFrames
     validation: OffsetFrames
+    window: Window | None = None
+    """What a decoder draws; both images whole without it."""
+    values: Float[Tensor, "frames P 3"] | None = None
+    """What is drawn of the frames to train on, if that is known from another lesson of the same frames."""
 
 
 @dataclass(slots=True, eq=False)
@@ -189,10 +80,10 @@ class OffsetTraining:
     schedule: torch.optim.lr_scheduler.CosineAnnealingLR
     lesson: OffsetLesson
     sampler: OffsetSampler
-    mask: Bool[Tensor, "2 size size"]
-    """Texels that count."""
-    drawn: Float16[Tensor, "frames 6 size size"] | None
-    """The images to learn, for the decoder."""
+    canvas: Canvas | None
+    """What a decoder draws on."""
+    targets: Tensor
+    """What is drawn of each frame for a decoder; coefficients or offsets for the baselines."""
     losses: list[float]
     """Mean over an epoch's batches, of every epoch so far."""
     errors: list[float]
@@ -212,18 +103,41 @@ class OffsetTraining:
 def start_training(network: nn.Module, lesson: OffsetLesson, config: OffsetTrainingConfig) -> OffsetTraining:
     """Make a network that has learned nothing ready for its first epoch; seeds torch's generator."""
     torch.manual_seed(config.seed)
-    drawn = _drawn(lesson.layout, lesson.train) if isinstance(network, ImageDecoder) else None
-    if drawn is not None:
+    canvas, offsets = None, lesson.train.offsets
+    if isinstance(network, ImageDecoder):
         network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
-        drawn = drawn.contiguous(memory_format=torch.channels_last)
+        canvas = Canvas.create(lesson.layout, lesson.window)
+        known = lesson.values
+        targets = torch.from_numpy(drawn_values(lesson.layout, offsets.numpy())) if known is None else known
+    else:
+        assert lesson.window is None, "the baselines have no images"
+        targets = network.coefficients(offsets) if isinstance(network, PcaFullyConnected) else offsets
     if config.centred:
-        _start_from_mean(network, lesson.train, drawn)
+        _start_from_mean(network, canvas, targets)
     optimizer = torch.optim.Adam(network.parameters(), lr=config.learning_rate)
     falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, config.epochs)
-    mask = torch.from_numpy(lesson.layout.mask).permute(2, 0, 1)
-    return OffsetTraining(
-        network, copy.deepcopy(network), optimizer, falling, lesson, OffsetSampler(lesson.layout), mask, drawn, [], []
-    )
+    sampler = OffsetSampler(lesson.layout, lesson.window)
+    return OffsetTraining(network, copy.deepcopy(network), optimizer, falling, lesson, sampler, canvas, targets, [], [])
+
+
+def _start_from_mean(network: nn.Module, canvas: Canvas | None, targets: Tensor) -> None:
+    """Let a network that has learned nothing yet give the mean of the frames, whatever the pose."""
+    mean = targets.mean(dim=0, keepdim=True, dtype=torch.float64).float()
+    with torch.no_grad():
+        if isinstance(network, ImageDecoder):
+            assert canvas is not None
+            network.mean.copy_(canvas.draw(mean)[0])
+            last = network.last
+        elif isinstance(network, FullyConnected):
+            last = network.layers[-1]
+            assert isinstance(last, nn.Linear)
+        else:
+            return
+        assert last.bias is not None
+        last.weight.zero_()
+        last.bias.zero_()
+        if isinstance(network, FullyConnected):
+            last.bias.copy_(mean.flatten())
 
 
 def train_epoch(training: OffsetTraining, config: OffsetTrainingConfig) -> None:
@@ -234,43 +148,49 @@ def train_epoch(training: OffsetTraining, config: OffsetTrainingConfig) -> None:
     for rows in torch.randperm(len(train)).split(config.batch):
         if len(rows) == 1 and len(train) > 1:
             continue  # batch norm needs two
-        loss = _loss(training, train.rows(rows), rows, config)
+        loss = _loss(training, rows, config)
         training.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         training.optimizer.step()
         losses.append(loss.item())
     training.schedule.step()
-    error = vertex_errors_cm(predict(training.network, training.sampler, validation), validation.vertices)
+    truth = validation.vertices[:, training.sampler.vertices]
+    error = vertex_errors_cm(predict(training.network, training.sampler, validation), truth)
     if not training.errors or error < min(training.errors):
         training.best.load_state_dict(training.network.state_dict())
     training.losses.append(float(np.mean(losses)))
     training.errors.append(error)
 
 
-def _loss(
-    training: OffsetTraining, part: OffsetFrames, rows: Int[Tensor, " B"], config: OffsetTrainingConfig
-) -> Float[Tensor, ""]:
-    """Of a batch: of offsets for the baselines; of images, and with a weight of normals, for the decoder."""
-    drawn = training.drawn
-    half_precision = config.half_precision and drawn is not None
-    with torch.autocast("cpu", torch.bfloat16, enabled=half_precision):
-        made = training.network(part.pose)
-    if drawn is None:
-        return (made - part.offsets).norm(dim=-1).mean()
+def _loss(training: OffsetTraining, rows: Int[Tensor, " B"], config: OffsetTrainingConfig) -> Float[Tensor, ""]:
+    """Of a batch: of offsets or coefficients for the baselines; of images, and with a weight each of normals and edge
+    lengths, for a decoder."""
+    network, canvas, frames = training.network, training.canvas, training.lesson.train
+    pose, targets = frames.pose[rows], training.targets[rows]
+    if isinstance(network, PcaFullyConnected):
+        return (network.layers(pose) - targets).square().sum(dim=-1).mean()
+    if canvas is None:
+        return (network(pose) - targets).norm(dim=-1).mean()
+    with torch.autocast("cpu", torch.bfloat16, enabled=config.half_precision):
+        made = network(pose)
     made = made.float()
-    loss = grid_loss(made, drawn[rows].float(), training.mask, config.norm)
-    if config.normal_weight > 0:
-        faces = torch.from_numpy(training.lesson.layout.garment.template.faces).long()
-        placed = training.sampler.positions(training.sampler(made), part.points, part.axes)
-        loss = loss + config.normal_weight * normal_loss(placed, part.vertices, faces)
+    loss = grid_loss(made, canvas.draw(targets), canvas.mask, config.norm)
+    if config.normal_weight > 0 or config.edge_weight > 0:
+        sampler = training.sampler
+        points, axes = frames.points[rows][:, sampler.pixels], frames.axes[rows][:, sampler.pixels]
+        placed, truth = sampler.positions(sampler(made), points, axes), frames.vertices[rows][:, sampler.vertices]
+        if config.normal_weight > 0:
+            loss = loss + config.normal_weight * normal_loss(placed, truth, sampler.faces)
+        if config.edge_weight > 0:
+            loss = loss + config.edge_weight * edge_length_loss(placed, truth, sampler.edges)
     return loss
 
 
 def train_offsets(network: nn.Module, lesson: OffsetLesson, config: OffsetTrainingConfig) -> list[float]:
     """Train a decoder or a baseline in place, keep its best epoch; the validation error of every epoch, cm.
 
-    Baselines minimise the mean length of the difference of offsets; the decoder the grid loss, and with a weight the
-    loss of the normals.
+    The baseline without PCA minimises the mean length of the difference of offsets, that with PCA squared differences
+    of coefficients; decoders the grid loss, and with a weight each the losses of normals and of edge lengths.
     """
     training = start_training(network, lesson, config)
     while not training.is_over(config):

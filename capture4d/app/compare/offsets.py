@@ -13,9 +13,11 @@ import torch
 
 from capture4d.app.compare.garment import MB, ModelledSurface
 from capture4d.types import Body, PoseSequence, RegisteredSequence
-from wrinkles.offset_images.layout import OffsetLayout, OffsetSampler
+from wrinkles.offset_images.canvas import OffsetSampler
+from wrinkles.offset_images.frames import offset_frames
+from wrinkles.offset_images.layout import OffsetLayout
 from wrinkles.offset_images.model_files import BASELINE, DECODER, LearnedOffsets, OffsetModel
-from wrinkles.offset_images.training import offset_frames, predict
+from wrinkles.offset_images.training import predict
 
 __all__ = ["megabytes", "offset_surfaces"]
 

@@ -19,6 +19,7 @@ INPUTS = {
     "check": ("no-capture",),
     "compare": ("no-work", "--model", "no-model"),
     "wrinkles offsets": ("no-work",),
+    "offsets train": ("no-drapes", "--output", "out"),
     "convert-poses": ("no.bvh", "out.npz"),
     "register-mesh": ("no.ply", "no.ply", "--output", "out.ply"),
 }
@@ -89,6 +90,8 @@ SAME = "--registration.coarse.compression 2 --registration.dense.compression"  #
         ("fit", "--kernel.control.history 2", "--kernel.control.history: expected 0, for kernels carry nothing on"),
         ("animate", "--beta nan", "--beta: expected a finite number, found nan"),
         ("wrinkles offsets", "--texels 48", "--texels: expected a power of two, found 48"),
+        ("offsets train", "--patch.texels 81", "--patch.texels: expected a multiple of 8, found 81"),
+        ("offsets train", "--residual --partner", "--partner: expected one of residual and partner, found True"),
         ("check", "--workers 0", "--workers: expected at least 1, found 0"),
         ("check", "--fps -1", "--fps: expected a positive number, found -1"),
         ("convert-poses", "--fps 0", "--fps: expected a positive number, found 0"),

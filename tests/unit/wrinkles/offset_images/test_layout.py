@@ -11,19 +11,13 @@ from capture4d.errors import InputError
 from capture4d.learning.networks import ImageDecoder
 from capture4d.types import Body, Garment, Mesh, PoseSequence
 from tests.unit.wrinkles.conftest import sleeve, wrinkled
+from wrinkles.offset_images.canvas import OffsetSampler
 from wrinkles.offset_images.config import OffsetTrainingConfig
-from wrinkles.offset_images.layout import Anchors, OffsetLayout, OffsetSampler, decode, encode
+from wrinkles.offset_images.frames import offset_frames, pose_joints, vertex_errors_cm
+from wrinkles.offset_images.layout import Anchors, OffsetLayout, decode, encode
+from wrinkles.offset_images.losses import grid_loss, normal_loss
 from wrinkles.offset_images.networks import FullyConnected, PcaFullyConnected
-from wrinkles.offset_images.training import (
-    OffsetLesson,
-    grid_loss,
-    normal_loss,
-    offset_frames,
-    pose_joints,
-    predict,
-    train_offsets,
-    vertex_errors_cm,
-)
+from wrinkles.offset_images.training import OffsetLesson, predict, train_offsets
 
 
 def limb() -> Body:

@@ -16,11 +16,13 @@ from capture4d.files.records import load_garment, save_body, save_garment, save_
 from capture4d.types import PoseSequence
 from tests.unit.wrinkles.conftest import make_work, outside_the_unit_square, some_garment, some_scan
 from tests.unit.wrinkles.offset_images.test_layout import limb, turned, upright
-from wrinkles.offset_images import stage
+from wrinkles.offset_images import resumable, stage
+from wrinkles.offset_images.canvas import OffsetSampler
 from wrinkles.offset_images.config import OffsetConfig, OffsetTrainingConfig
-from wrinkles.offset_images.layout import OffsetLayout, OffsetSampler
+from wrinkles.offset_images.frames import offset_frames, vertex_errors_cm
+from wrinkles.offset_images.layout import OffsetLayout
 from wrinkles.offset_images.model_files import NETWORKS, OFFSETS, find_offsets, load_offset_model
-from wrinkles.offset_images.training import offset_frames, predict, vertex_errors_cm
+from wrinkles.offset_images.training import predict
 
 FRAMES = 12
 CONFIG = OffsetConfig(
@@ -109,7 +111,7 @@ def test_what_was_learned_is_found_again(taken: Path, learned: Path):
 def test_a_stopped_training_ends_with_the_same_bits(
     work: Path, learned: Path, monkeypatch: pytest.MonkeyPatch, stop: int
 ):
-    epoch, done = stage.train_epoch, []
+    epoch, done = resumable.train_epoch, []
 
     def stopping(*arguments: object) -> None:
         done.append(1)
@@ -117,10 +119,10 @@ def test_a_stopped_training_ends_with_the_same_bits(
             raise KeyboardInterrupt
         epoch(*arguments)  # pyright: ignore
 
-    monkeypatch.setattr(stage, "train_epoch", stopping)
+    monkeypatch.setattr(resumable, "train_epoch", stopping)
     with pytest.raises(KeyboardInterrupt):
         stage.run(open_work(work), work / OFFSETS, CONFIG)
-    monkeypatch.setattr(stage, "train_epoch", epoch)
+    monkeypatch.setattr(resumable, "train_epoch", epoch)
     stage.run(open_work(work), work / OFFSETS, CONFIG)
     again, whole = contents(work / OFFSETS), contents(learned)
     assert sorted(again) == sorted(whole)
