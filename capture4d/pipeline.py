@@ -241,13 +241,9 @@ def check_rig(
 
 
 def check(
-    capture: Place,
-    output: Place | None = None,
-    claims: Claims | None = None,
-    *,
-    all_frames: bool = False,
+    capture: Place, output: Place | None = None, claims: Claims | None = None, *, all_frames: bool = False,
     workers: int = 1,
-) -> Checked:
+) -> Checked:  # fmt: skip
     """Look through a take before a night is spent on it: `.verdict.findings`, worst first.
 
     Args:
