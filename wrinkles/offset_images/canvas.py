@@ -94,7 +94,7 @@ class Canvas:
 
     @staticmethod
     def create(layout: OffsetLayout, window: Window | None = None) -> Canvas:
-        size, matrix = layout.size, drawing_matrix(layout).astype(np.float32)
+        size, matrix = layout.size, csr_matrix(drawing_matrix(layout), dtype=np.float32)
         mask = layout.mask.transpose(2, 0, 1)
         if window is not None:
             rows = window.top + np.arange(window.rows)[:, None]
