@@ -20,10 +20,10 @@ from typing import Any, NoReturn
 from capture4d.cli.answers import TerminatedError, answer_to, complain
 from capture4d.cli.commands.capture import Calibrate, Check, CheckRig
 from capture4d.cli.commands.doctor import Doctor
+from capture4d.cli.commands.drape_offsets import OffsetsPredict, OffsetsTrain
 from capture4d.cli.commands.files import ConvertBody, ConvertPoses, ConvertRig, RegisterMesh, Template
 from capture4d.cli.commands.folders import Diff, Status
 from capture4d.cli.commands.models import Animate, Fit
-from capture4d.cli.commands.offsets import OffsetsPredict, OffsetsTrain
 from capture4d.cli.commands.stages import Extract, Register, Report, Run, Track
 from capture4d.cli.commands.synthesis import Demo, Scan, Synth, SynthBoard, SynthDrapes
 from capture4d.cli.commands.wrinkles import Compare, WrinklesApply, WrinklesMaps, WrinklesOffsets, WrinklesTrain
