@@ -168,6 +168,8 @@ def _rest_lengths(case: _Case, garment: Garment) -> np.ndarray:
 
 def _measured(case: _Case, garment: Garment, wrap: Wrap) -> list[Metric]:
     plain, _ = _template(case, wrap=False)
+    assert plain.embedding_faces is not None
+    assert plain.embedding_barycentric is not None
     corners = case.body.vertices()[case.body.shaped.body.template.faces[plain.embedding_faces]]
     nearest = np.einsum("vk,vkc->vc", plain.embedding_barycentric, corners)
     of_nearest = edge_ratio_spread(nearest, garment.template.faces, _rest_lengths(case, garment))

@@ -175,7 +175,8 @@ def _write_drape_offsets(path: Path) -> None:
     apart = np.arange(3, dtype=np.float32)[:, None, None] / 3  # a face is an island of three pixels
     uv = apart + np.array([[0, 0], [0.25, 0], [0, 0.25]], np.float32)
     garment = replace(GARMENT, template=Mesh(MESH.vertices, MESH.faces, uv))
-    kernels = PoseKernels(*(RNG.random(size, np.float32) for size in ((4, 18), (4, 2), (27,), (2, 27))), 1.0, 0.1)
+    poses, dual, mean, components = (RNG.random(size, np.float32) for size in ((4, 18), (4, 2), (27,), (2, 27)))
+    kernels = PoseKernels(poses, dual, mean, components, 1.0, 0.1)
     config = DrapeOffsetsConfig(network="kernels", texels=64)
     parts = ModelParts(config, garment, BODY, np.zeros(2, np.float32), NAMES[1:3], None, kernels, None)
     save_model_parts(path.parent, parts)

@@ -310,8 +310,12 @@ PRESETS: dict[str, SynthConfig] = {
 }
 """Takes by name, from minutes to an hour."""
 
-_AT_WAIST = {"hold_hz": 80.0, "hold_depth_m": 0.04, "hold_floor": 0.02, "hold_ripple_m": 0.0}
-"""A waistband keeps its seat with a hold as firm as this: its few centimetres carry the whole garment."""
+
+def _at_waist(simulation: SimulationConfig) -> SimulationConfig:
+    """A waistband keeps its seat with a hold as firm as this: its few centimetres carry the whole garment."""
+    return replace(simulation, hold_hz=80.0, hold_depth_m=0.04, hold_floor=0.02, hold_ripple_m=0.0)
+
+
 _WHOLE_PERSON = ScannerConfig(rig=RigConfig(image_size=800))
 """Cameras stand farther away where the whole person is in view, and need more pixels."""
 _SHIRT = replace(_FULL, name="shirt-200k", garment="shirt", fabric="shirt-cotton", frames=212)
@@ -323,7 +327,7 @@ _TROUSERS = replace(
     fabric="twill",
     frames=186,
     motion=MotionConfig("range-of-legs"),
-    simulation=SimulationConfig(**_AT_WAIST),
+    simulation=_at_waist(SimulationConfig()),
     scanner=_WHOLE_PERSON,
 )
 _SKIRT = replace(_TROUSERS, name="skirt-200k", garment="skirt", cut=None, fabric="shirt-cotton")
@@ -340,7 +344,7 @@ def _small(full: SynthConfig, name: str, motion: ClipName) -> SynthConfig:
         capture_every=4,
         template_vertices=tiny.template_vertices,
         motion=MotionConfig(motion),
-        simulation=coarse if full.garment == "shirt" else replace(coarse, **_AT_WAIST),
+        simulation=coarse if full.garment == "shirt" else _at_waist(coarse),
         relaxation=tiny.relaxation,
         scanner=replace(
             tiny.scanner,

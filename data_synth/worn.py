@@ -77,5 +77,5 @@ def template_weights(config: SynthConfig, points: np.ndarray, body: PosedBody) -
     """Skin weights, (V, J), of a template that hangs loose on a body in the dressing pose; None: the skin beneath's."""
     if config.garment != "skirt":
         return None
-    near = GARMENTS["skirt"].parts(body.shaped).any(axis=0)
+    near = np.asarray(GARMENTS["skirt"].parts(body.shaped).any(axis=0))
     return loose_weights(points, body, near=near, follow=config.skirt_weights or "distance")

@@ -265,7 +265,7 @@ def _without_floor(
     on_floor = find_floor(scan.vertices.astype(np.float64), scan.faces)
     if on_floor is None or find_floor(start, template.faces) is not None:
         return scan, colours, 0.0
-    kept_faces = ~on_floor[scan.faces].any(axis=1)
+    kept_faces = np.asarray(~on_floor[scan.faces].any(axis=1))
     shown, kept = submesh(scan, kept_faces)
     return shown, None if colours is None else colours[kept], 100.0 * float(on_floor.mean())
 

@@ -43,7 +43,7 @@ class ImageDecoder(nn.Module):
         Args:
             first: texels of the first map, a side or rows and columns.
             shuffled: doublings at the end that one convolution does by pixel shuffle (Shi et al., Real-time single
-                image and video super-resolution, CVPR 2016): as many parameters, in less than half the time.
+                image and video super-resolution, CVPR 2016): as many parameters, in about half the time.
             hidden: sizes of fully connected layers before the one that makes the first map; None has a transposed
                 convolution make it.
         """

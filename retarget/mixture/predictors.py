@@ -51,7 +51,8 @@ class Ensemble:
         said: list[np.ndarray] = []
         if self.networks:
             inputs = joined(pose, numbers)
-            said.append(np.mean([said_by(network, inputs) for network in self.networks], axis=0, dtype=np.float64))
+            answers = np.stack([said_by(network, inputs) for network in self.networks])
+            said.append(np.asarray(answers.mean(axis=0, dtype=np.float64)))
         if self.kernels is not None:
             said.append(self.kernels.predict(joined(pose, self.style_weight * numbers)))
         return self.head.decoded(np.mean(said, axis=0))

@@ -94,12 +94,12 @@ class Canvas:
 
     @staticmethod
     def create(layout: OffsetLayout, window: Window | None = None) -> Canvas:
-        size, matrix = layout.size, drawing_matrix(layout).astype(np.float32)
+        size, matrix = layout.size, csr_matrix(drawing_matrix(layout), dtype=np.float32)
         mask = layout.mask.transpose(2, 0, 1)
         if window is not None:
             rows = window.top + np.arange(window.rows)[:, None]
             columns = window.left + np.arange(window.columns)
-            matrix = matrix[(window.image * size**2 + rows * size + columns).ravel()]
+            matrix = csr_matrix(matrix[(window.image * size**2 + rows * size + columns).ravel()])  # pyright: ignore[reportIndexIssue]
             first, last, left, right = window.context
             wanted = (rows >= first) & (rows < last) & (columns >= left) & (columns < right)
             mask = (mask[window.image][rows, columns] & wanted)[None]

@@ -109,8 +109,8 @@ class DrapeOffsetsConfig:
     texels: Texels = 256
     """Side of the images."""
     shuffled: Annotated[int, Range(least=0, most=3)] = 2
-    """Doublings at the end that one convolution does by pixel shuffle; the paper has none, and takes 2.4 times as
-    long."""
+    """Doublings at the end that one convolution does by pixel shuffle; the paper has none, and takes nearly twice
+    as long."""
     components: Count = 128
     """Principal components, at most, that `pca` gives."""
     mirrored: bool = True

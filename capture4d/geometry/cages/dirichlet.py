@@ -92,7 +92,7 @@ class Extension:
     """
 
     def __init__(self, form: sparse.csc_array, cage: Integer[np.ndarray, " C"]) -> None:
-        self.count = form.shape[0]
+        self.count = len(form.diagonal())
         self.cage = np.asarray(cage, np.int64)
         inside = np.ones(self.count, bool)
         inside[self.cage] = False

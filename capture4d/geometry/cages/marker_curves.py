@@ -103,7 +103,7 @@ def curve_through(
         found = least_squares(
             partial(segments.residuals, weight=weight),
             (tangents + nudge).ravel(),
-            jac=partial(segments.jacobian, weight=weight),
+            jac=partial(segments.jacobian, weight=weight),  # pyright: ignore[reportArgumentType]
             max_nfev=40,
         )
         tangents = found.x.reshape(-1, 3)

@@ -27,7 +27,9 @@ def padded_change(
         if not len(raster.texels):
             continue
         inside = raster.image(raster.inside)
-        row, column = distance_transform_edt(~inside, return_distances=False, return_indices=True)
+        nearest = distance_transform_edt(~inside, return_distances=False, return_indices=True)
+        assert nearest is not None
+        row, column = nearest
         part = slice(3 * side, 3 * side + 3)
         padded[..., part] = change[row, column, part]
     return padded

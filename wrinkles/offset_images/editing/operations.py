@@ -75,7 +75,7 @@ def parse_operations(tree: Mapping[str, Any]) -> list[Operation]:
 def _parsed(row: Any, name: str) -> Operation:
     if not isinstance(row, dict):
         raise InputError(f"{name}: expected an object")
-    kind = next((each for each in VALUES if each == row.get("do")), None)
+    kind: Kind | None = next((each for each in VALUES if each == row.get("do")), None)
     if kind is None:
         raise InputError(f"{name}.do: expected {', '.join(VALUES)}, found {str(row.get('do'))[:40]!r}")
     known = {"do", "side", "stroke", "radius", *VALUES[kind], *(("from",) if kind == "transfer" else ())}

@@ -173,6 +173,20 @@ def test_a_stopped_training_ends_with_the_same_bits(
     assert [name for name, data in whole.items() if again[name] != data] == []
 
 
+def test_given_labels_say_what_the_patches_are(drapes: Path, tmp_path: Path):
+    """The vertices of the sleeve's upper half, on both of its panels: four patches of two labels."""
+    garment = read_drapes(drapes).garment.template
+    upper = garment.vertices[garment.faces].mean(axis=1)[:, 1] > 0.25
+    np.save(tmp_path / "labels.npy", np.where(upper, 7, 3))
+    config = replace(PATCHES, training=replace(TRAINING, epochs=1))
+    result = train_stage.run(drapes, tmp_path / "model", config, labels=tmp_path / "labels.npy")
+    model = load_drape_offsets(result.path)
+    assert len(model.networks) == 4
+    np.testing.assert_array_equal(model.parts.labels, np.where(upper, 7, 3))
+    read = np.concatenate([sampler.vertices.numpy() for sampler in model.samplers])
+    assert set(read) == set(range(len(garment.vertices)))
+
+
 def test_a_strip_is_learned_with_all_three_losses(tmp_path: Path):
     """The necktie's recipe, on a piece of cloth in one image: edges gain by their loss."""
     drapes = write_drapes(tmp_path / "drapes", flat=True)
