@@ -99,7 +99,7 @@ class Canvas:
         if window is not None:
             rows = window.top + np.arange(window.rows)[:, None]
             columns = window.left + np.arange(window.columns)
-            matrix = csr_matrix(matrix[(window.image * size**2 + rows * size + columns).ravel()])  # pyright: ignore[reportIndexIssue]
+            matrix = csr_matrix(matrix[(window.image * size**2 + rows * size + columns).ravel()])
             first, last, left, right = window.context
             wanted = (rows >= first) & (rows < last) & (columns >= left) & (columns < right)
             mask = (mask[window.image][rows, columns] & wanted)[None]
