@@ -59,7 +59,7 @@ class PoseNumbers:
         chosen = rotations[:, list(self.joints)].astype(np.float64)
         if self.kind == "axis-angle":
             chosen = Rotation.from_matrix(chosen.reshape(-1, 3, 3)).as_rotvec()
-        flat = chosen.reshape(len(rotations), -1)
+        flat = chosen.reshape(len(rotations), len(self.mean))
         return ((flat - self.mean) / self.scale).astype(np.float32)
 
 
