@@ -100,7 +100,7 @@ class Head:
         return Head(mean, directions, max(spread, 1e-9))
 
     def encoded(self, displacements: Float[np.ndarray, "drapes verts 3"]) -> Float32[np.ndarray, "drapes outputs"]:
-        flat = displacements.reshape(len(displacements), -1) - self.mean
+        flat = displacements.reshape(-1, len(self.mean)) - self.mean
         turned = flat if self.directions is None else flat @ self.directions.T
         return (turned / self.scale).astype(np.float32)
 
