@@ -18,6 +18,7 @@ demo: $(STAMP)
 
 # Threads that wait for each other over small matrices only slow the tests down.
 test: export OPENBLAS_NUM_THREADS = 1
+test: export OMP_NUM_THREADS = 1
 test: $(STAMP)
 	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile
 

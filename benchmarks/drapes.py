@@ -22,8 +22,9 @@ from capture4d.body.anny import load_anny
 from capture4d.body.skinning import with_pose
 from capture4d.geometry.mesh import edge_lengths
 from capture4d.runs.workers import run_jobs
+from data_synth.cloth.fabrics import FABRICS
 from data_synth.cloth.simulation import simulate
-from data_synth.config import FABRICS, SimulationConfig
+from data_synth.config import SimulationConfig
 from data_synth.drapes.config import DrapesConfig, GarmentName
 from data_synth.drapes.draping import Draper
 from data_synth.drapes.garments import GARMENTS

@@ -26,11 +26,12 @@ from capture4d.geometry.mesh import vertex_normals
 from capture4d.geometry.triangles import count_intersecting_faces
 from capture4d.runs.workers import run_jobs
 from capture4d.types import Mesh
+from data_synth.cloth.fabrics import FABRICS
 from data_synth.cloth.patterns import locate
 from data_synth.cloth.quality import measure_cloth, principal_stretches
 from data_synth.cloth.simulation import dress, simulate
 from data_synth.cloth.wrinkle_relaxation import lift_levels, relax_levels
-from data_synth.config import FABRICS, OTHER_BODIES, PRESETS, MotionConfig, SynthConfig, folded
+from data_synth.config import OTHER_BODIES, PRESETS, MotionConfig, SynthConfig, folded
 from data_synth.scanner.scan import LABEL_BODY, scan_surfaces
 from data_synth.stage import run as synthesise
 from data_synth.take import TakePlan, plan_take, simulate_take, take_rig, take_surfaces

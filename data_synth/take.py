@@ -16,12 +16,13 @@ from capture4d.body.anny import load_anny
 from capture4d.body.skinning import PosedBody, ShapedBody, pose_frame, with_shape
 from capture4d.motions.retargeting import pose_sequence
 from capture4d.types import Mesh, PoseSequence, Rig
+from data_synth.cloth.fabrics import FABRICS
 from data_synth.cloth.panels import Pattern
 from data_synth.cloth.patterns import PanelMesh, grade, mesh_pattern
 from data_synth.cloth.simulation import approach_poses, simulate
 from data_synth.cloth.tailoring import Made, tailor
 from data_synth.cloth.wrinkle_relaxation import Finish, Level, WrinkleMesh, relax_levels, wrinkle_mesh
-from data_synth.config import FABRICS, SynthConfig
+from data_synth.config import SynthConfig
 from data_synth.motions import make_motion
 from data_synth.outfits import OUTFITS, Outfit
 from data_synth.prints import printed_cloth

@@ -68,8 +68,7 @@ def make_template(
     uv_is_pattern: bool = False,
     follow: Follow = "skin",
     names: Sequence[str] = (),
-    wrap: bool = False,
-    cage: CageMarks | None = None,
+    wrap: bool | CageMarks = False,
     source: str = "mesh",
 ) -> tuple[Garment, TemplateReport]:
     """Bind a mesh to the body it lies on, and take it to the rest pose.
@@ -81,8 +80,8 @@ def make_template(
         uv_is_pattern: the UVs are the sewing pattern, whatever they look like; else they are compared with one.
         follow: what moves it, as `TemplateConfig.follow` says.
         names: of the loops, the one with the most vertices first; found by position if empty.
-        wrap: bind each vertex to where it comes to lie when the mesh is shrunk onto the body, not to its nearest point.
-        cage: along which it is shrunk, marked on the mesh as it came; found if None.
+        wrap: bind each vertex to where it comes to lie when the mesh is shrunk onto the body, not to its nearest point;
+            along a cage that is found, or that is marked on the mesh as it came.
         source: what errors call the mesh.
     Raises:
         InputError: the mesh cannot be a template; says what was expected.
@@ -107,9 +106,9 @@ def make_template(
     own = fresh or (kept is None and not uv_is_pattern)
     metres, pattern = _pattern(mesh, source, own=own, told=uv_is_pattern)
     wrapped = None
-    if wrap:
+    if wrap is not False:
         panels = None if own else kept
-        marked = found_cage(mesh, binding.weights, panels) if cage is None else cage.on(mesh, welded.of_vertex)
+        marked = found_cage(mesh, binding.weights, panels) if wrap is True else wrap.on(mesh, welded.of_vertex)
         flat = metres * kept.astype(np.float64) if metres and kept is not None else flattened(mesh.vertices, mesh.faces)
         wrapped = wrap_garment(mesh, binding.surface, binding.normals, binding.nearest.points, cage=marked, flat=flat)
         binding = binding.moved_to(mesh, wrapped.placed.faces, wrapped.placed.barycentric)

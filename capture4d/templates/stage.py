@@ -85,8 +85,7 @@ def run(
         uv_is_pattern=config.uv_is_pattern,
         follow=config.follow,
         names=config.loop_names,
-        wrap=config.wrap,
-        cage=marks,
+        wrap=config.wrap if marks is None else marks,
         source=source,
     )
     save_garment(output, garment)

@@ -24,10 +24,11 @@ from capture4d.geometry.mesh import unique_edges, vertex_adjacency, vertex_norma
 from capture4d.geometry.ray_casting import TriangleScene
 from capture4d.heavy_imports import import_warp
 from capture4d.types import PoseSequence
+from data_synth.cloth.fabrics import Fabric
 from data_synth.cloth.panels import Pattern
 from data_synth.cloth.patterns import PanelMesh, smooth_noise
 from data_synth.cloth.tailoring import Made, Sleeve, Wall, bending_factors, wall_heights, walls
-from data_synth.config import Fabric, SimulationConfig
+from data_synth.config import SimulationConfig
 
 __all__ = ["approach_poses", "clear_of_body", "dress", "dressing_rotations", "simulate"]
 

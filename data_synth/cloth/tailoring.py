@@ -15,9 +15,10 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from capture4d.body.skinning import PosedBody
+from data_synth.cloth.fabrics import Fabric
 from data_synth.cloth.panels import Pattern
 from data_synth.cloth.patterns import PanelMesh, smooth_noise
-from data_synth.config import Fabric, FoldConfig
+from data_synth.config import FoldConfig
 
 __all__ = ["Made", "Sleeve", "Tailoring", "Wall", "bending_factors", "shrunk", "tailor", "wall_heights", "walls"]
 

@@ -23,11 +23,12 @@ from numba import njit
 from capture4d.body.skinning import PosedBody
 from capture4d.geometry.mesh import vertex_adjacency, vertex_normals
 from capture4d.geometry.ray_casting import TriangleScene, barycentric
+from data_synth.cloth.fabrics import Fabric
 from data_synth.cloth.patterns import PanelMesh, locate, smooth_noise
 from data_synth.cloth.stencils import hinges, rest_lengths
 from data_synth.cloth.tailoring import Made, Sleeve, Wall, bending_factors, shrunk, wall_heights, walls
 from data_synth.cloth.tightening import tighten
-from data_synth.config import Fabric, RelaxationConfig
+from data_synth.config import RelaxationConfig
 
 __all__ = [
     "BodyPlanes",

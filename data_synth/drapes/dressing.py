@@ -18,10 +18,11 @@ from capture4d.cache import user_cache_folder
 from capture4d.files.arrays import ArrayFile
 from capture4d.files.atomic import write_npz
 from capture4d.geometry.triangles import count_intersecting_faces
+from data_synth.cloth.fabrics import FABRICS
 from data_synth.cloth.panels import Pattern
 from data_synth.cloth.patterns import PanelMesh, mesh_pattern
 from data_synth.cloth.simulation import dress, simulate
-from data_synth.config import FABRICS, SimulationConfig
+from data_synth.config import SimulationConfig
 from data_synth.drapes.config import STYLES, GarmentName
 from data_synth.drapes.garments import GARMENTS, Placement, panel_vertices
 

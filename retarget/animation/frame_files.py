@@ -7,7 +7,7 @@ registration/vertices.npy metrics.jsonl   all of them
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from capture4d.captures.work_folder import VERDICTS, stack_vertices
+from capture4d.captures.work_folder import ANIMATE, VERDICTS, stack_vertices
 from capture4d.files.atomic import read_json, write_json, write_json_lines, write_npz
-from capture4d.runs.stage import Stage, StageResult
+from capture4d.runs.stage import Stage, StageResult, open_stage
 from capture4d.types import PoseSequence
 from retarget.animation.animator import AnimatedFrame
 
-__all__ = ["SCHEMA", "FrameFiles", "collect", "motion_files", "write_frame"]
+__all__ = ["FrameFiles", "collect", "motion_files", "open_frames", "write_frame"]
 
 SCHEMA = 2
 """Of an animation's output."""
@@ -33,6 +33,26 @@ stretch like that. The limits are registration's (`quality.stretch_check`, `qual
 FLIPPED_CHECK_PERCENT = 1.0
 """A frame with more of its faces turned against the body is flagged (registration's `quality.flipped_check_percent`,
 which goes by the scan)."""
+
+
+def open_frames(
+    output: Path,
+    config: Mapping[str, Any],
+    upstream: Mapping[str, str],
+    sources: Mapping[str, Path],
+    *,
+    overwrite: bool,
+) -> Stage:
+    """The stage of an animation's frames, which is that of a registration."""
+    return open_stage(
+        output / "registration",
+        name=ANIMATE,
+        schema=SCHEMA,
+        config=config,
+        upstream=upstream,
+        sources=sources,
+        overwrite=overwrite,
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,19 +18,18 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from capture4d.body.skinning import ShapedBody
-from capture4d.captures.work_folder import ANIMATE
 from capture4d.errors import InputError
 from capture4d.files.arrays import map_array
 from capture4d.files.atomic import file_digest, write_npy
 from capture4d.files.outputs import require_apart
 from capture4d.files.records import load_body, load_poses, save_body, save_garment, save_poses
 from capture4d.motions.motion_files import rate_note, read_motion, resample, same_rate, told
-from capture4d.runs.stage import Stage, StageResult, open_stage
+from capture4d.runs.stage import Stage, StageResult
 from capture4d.runs.workers import run_jobs
 from capture4d.types import PoseSequence
 from retarget.animation.animator import FRAMES_AT_ONCE, Animator
 from retarget.animation.bodies import captured_person, person_of_shape, require_motion, retargeted_mean
-from retarget.animation.frame_files import SCHEMA, FrameFiles, collect, motion_files, write_frame
+from retarget.animation.frame_files import FrameFiles, collect, motion_files, open_frames, write_frame
 from retarget.animation.frame_rates import coefficients_at, seconds
 from retarget.animation.garment_model import GarmentModel, load_garment_model
 from retarget.config import AnimateConfig
@@ -230,15 +229,9 @@ def _open(output: Path, scene: _Scene, config: AnimateConfig, regressor: str, ov
         regressor: digest of what the coefficients come from.
     """
     _require_no_take(output)
-    stage = open_stage(
-        output / "registration",
-        name=ANIMATE,
-        schema=SCHEMA,
-        config={**asdict(config), "beta": [float(value) for value in scene.person.shape]},
-        upstream={**scene.digests, "regressor": regressor},
-        sources=scene.sources,
-        overwrite=overwrite,
-    )
+    settings = {**asdict(config), "beta": [float(value) for value in scene.person.shape]}
+    upstream = {**scene.digests, "regressor": regressor}
+    stage = open_frames(output, settings, upstream, scene.sources, overwrite=overwrite)
     body, poses = motion_files(output)
     save_body(body, scene.person.body)
     save_poses(poses, scene.shown)

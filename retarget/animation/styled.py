@@ -13,17 +13,16 @@ from pathlib import Path
 
 import numpy as np
 
-from capture4d.captures.work_folder import ANIMATE
 from capture4d.errors import InputError
 from capture4d.files.atomic import file_digest
 from capture4d.files.records import save_body, save_garment, save_poses
 from capture4d.geometry.mesh import edge_lengths, edge_stretch, stretch_p99, unique_edges
 from capture4d.motions.motion_files import rate_note, read_motion, resample, same_rate, told
-from capture4d.runs.stage import StageResult, open_stage
+from capture4d.runs.stage import StageResult
 from capture4d.runs.workers import run_jobs
 from capture4d.types import PoseSequence
 from retarget.animation.animator import FRAMES_AT_ONCE, AnimatedFrame
-from retarget.animation.frame_files import SCHEMA, FrameFiles, collect, motion_files, write_frame
+from retarget.animation.frame_files import FrameFiles, collect, motion_files, open_frames, write_frame
 from retarget.config import AnimateConfig
 from retarget.mixture.model_files import MODEL_FILES, load_styled_garment
 from retarget.mixture.styled_garment import StyledGarment, WornGarment
@@ -57,15 +56,9 @@ def run(
     worn = known.worn(beta, style, config)
     motion = _motion(known, poses, worn, config.fps)
     files = [model / name for name in MODEL_FILES]
-    stage = open_stage(
-        output / "registration",
-        name=ANIMATE,
-        schema=SCHEMA,
-        config={**asdict(config), "beta": [*map(float, beta)], "style": dict(style)},
-        upstream={"model": file_digest(files, root=model), "poses": file_digest([poses], root=poses.parent)},
-        sources={"model": model, "poses": poses},
-        overwrite=overwrite,
-    )
+    settings = {**asdict(config), "beta": [*map(float, beta)], "style": dict(style)}
+    upstream = {"model": file_digest(files, root=model), "poses": file_digest([poses], root=poses.parent)}
+    stage = open_frames(output, settings, upstream, {"model": model, "poses": poses}, overwrite=overwrite)
     body_path, poses_path = motion_files(output)
     save_body(body_path, known.body)
     save_poses(poses_path, motion)

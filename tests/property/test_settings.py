@@ -132,7 +132,8 @@ def inside(place: Place) -> st.SearchStrategy[Any]:
     limits = place.range
     if place.kind is int:
         if PowerOfTwo in place.rules:
-            return st.integers(int(limits.least or 1).bit_length() - 1, 40).map(lambda power: 2**power)
+            most = 40 if limits.most is None else int(limits.most).bit_length() - 1
+            return st.integers(int(limits.least or 1).bit_length() - 1, most).map(lambda power: 2**power)
         low = limits.least if limits.above is None else limits.above + 1
         high = limits.most if limits.below is None else limits.below - 1
         found = st.integers(None if low is None else int(low), None if high is None else int(high))

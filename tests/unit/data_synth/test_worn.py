@@ -87,7 +87,7 @@ def test_takes_made_before_there_were_other_garments_keep_their_place(tmp_path, 
     monkeypatch.setattr("benchmarks.cached_takes.run", lambda *_, **__: None)
     for name in ("demo", "tshirt-200k", "tiny"):
         known = asdict(PRESETS[name])
-        for later in ("print", "print_mm", "garment", "cut", "skirt_weights"):
+        for later in ("print", "print_mm", "garment", "cut", "skirt_weights", "folds"):
             assert known.pop(later) is None
         key = hashlib.sha256(json.dumps([2, known], sort_keys=True).encode()).hexdigest()[:12]
         assert cached_take(PRESETS[name]).name == f"{name}-{key}"

@@ -93,10 +93,10 @@ def test_the_command_takes_labels_and_curves(tmp_path: Path, body: PosedBody, sk
 def test_a_cage_that_does_not_fit_is_told_by_its_file(tmp_path: Path, body: PosedBody, skin: Mesh) -> None:
     np.save(tmp_path / "labels.npy", np.zeros(7, np.int32))
     with pytest.raises(InputError, match=r"labels\.npy: expected a label for each of \d+ triangles, found \(7,\)"):
-        make_template(skin, body, wrap=True, cage=read_cage(tmp_path / "labels.npy"))
+        make_template(skin, body, wrap=read_cage(tmp_path / "labels.npy"))
     marks = CageMarks(curves=(np.array([0, 10**6], np.int32),), source="curves.json")
     with pytest.raises(InputError, match=r"curves\.json: expected vertices from 0 to \d+, found 1000000"):
-        make_template(skin, body, wrap=True, cage=marks)
+        make_template(skin, body, wrap=marks)
     np.save(tmp_path / "floats.npy", np.zeros(7))
     (tmp_path / "short.json").write_text('{"curves": [[1]]}')
     (tmp_path / "words.txt").write_text("1 2")

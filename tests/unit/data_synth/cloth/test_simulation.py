@@ -9,12 +9,13 @@ import pytest
 
 from capture4d.body.skinning import ShapedBody, unskin
 from capture4d.geometry.mesh import unique_edges
+from data_synth.cloth.fabrics import Fabric
 from data_synth.cloth.patterns import mesh_pattern
 from data_synth.cloth.simulation import approach_poses, dress, simulate
 from data_synth.cloth.template import bind_template
 from data_synth.cloth.tshirt import tshirt_pattern
 from data_synth.cloth.wrinkle_relaxation import BodySurface
-from data_synth.config import Fabric, GarmentStyle, MotionConfig, SimulationConfig
+from data_synth.config import GarmentStyle, MotionConfig, SimulationConfig
 from data_synth.motions import make_motion
 
 SETTINGS = SimulationConfig(vertices=500, calm_frames=12, approach_frames=6, rest_frames=2)

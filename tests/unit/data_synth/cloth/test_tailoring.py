@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from capture4d.body.skinning import ShapedBody, with_pose
+from data_synth.cloth.fabrics import Fabric
 from data_synth.cloth.panels import Pattern
 from data_synth.cloth.patterns import PanelMesh, locate, mesh_pattern
 from data_synth.cloth.tailoring import Made, bending_factors, shrunk, tailor, wall_heights, walls
 from data_synth.cloth.tshirt import tshirt_pattern
-from data_synth.config import Fabric, FoldConfig, GarmentStyle
+from data_synth.config import FoldConfig, GarmentStyle
 
 FOLDS = FoldConfig()
 

@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from data_synth.cloth.fabrics import Fabric
 from data_synth.cloth.panels import Edge, Panel, Pattern
 from data_synth.cloth.patterns import PanelMesh, mesh_pattern
 from data_synth.cloth.quality import measure_cloth, principal_stretches
@@ -20,7 +21,7 @@ from data_synth.cloth.wrinkle_relaxation import (
     relax_frame,
     wrinkle_mesh,
 )
-from data_synth.config import Fabric, RelaxationConfig
+from data_synth.config import RelaxationConfig
 
 SIDE = 0.3
 FAR_BODY = np.array([[-9.0, -9.0, -9.0], [9.0, -9.0, -9.0], [0.0, 9.0, -9.0]])
