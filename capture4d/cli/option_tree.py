@@ -102,6 +102,8 @@ def _options(kind: type, made: Any, names: tuple[str, ...], depth: int) -> Itera
             value = dataclasses.MISSING
         inner = _plain(hint)
         if dataclasses.is_dataclass(inner) and isinstance(inner, type):
+            if value is None:
+                continue  # absent as a whole; a preset that has it shows its options
             given = None if value is dataclasses.MISSING else value
             yield from _options(inner, given, (*names, renamed) if renamed else names, depth + 1)
             continue
