@@ -200,8 +200,8 @@ class SynthConfig:
     garment: GarmentKind | None = None
     """What is worn instead of a T-shirt: a shirt with long sleeves, trousers, or a skirt."""
     cut: tuple[str, ...] | None = None
-    """Of such a garment, NAME=VALUE each, as the styles of static drapes are given: size, ease, and what else its pattern
-    has."""
+    """Of such a garment, NAME=VALUE each, as the styles of static drapes are given: size, ease, and what else its
+    pattern has."""
     skirt_weights: Literal["distance", "root"] | None = None
     """How the template of a skirt follows the body: by the mean of the skin around it, weighted by inverse distance
     (also if absent), or the hips alone."""
