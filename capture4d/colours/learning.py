@@ -49,6 +49,8 @@ KERNEL = 0.05
 """Width of the density's kernel, radians."""
 MODE_DISTANCE = 0.16
 """Materials are at least this far apart, radians."""
+LEAST_PAINT = 0.001
+"""Share of the vertices that a given paint has to be seen on, to count where it is none of the frequent colours."""
 MIN_SHARE = 0.003
 """Share of the vertices that a material has at least."""
 BLEND_ANGLE = 0.06
@@ -120,7 +122,8 @@ def learn_colours(
     """
     light = fit_light(scans)
     flat = [light.removed(scan.mesh, scan.colours) for scan in scans]
-    colours = _materials(np.concatenate([_smoothed(s.mesh.faces, c) for s, c in zip(scans, flat, strict=True)]))
+    seen = np.concatenate([_smoothed(s.mesh.faces, c) for s, c in zip(scans, flat, strict=True)])
+    colours = _with_rare(_materials(seen), paints or (), seen)
     if len(colours) < 2:
         raise ColoursNotSeparableError(
             f"{source}: the colours of garment and suit are not separable: found {len(colours)} colour "
@@ -274,11 +277,29 @@ def _nearest(colours: UInt8[np.ndarray, "verts 3"], materials: Sequence[Colour])
     return np.asarray(nearest).astype(np.uint8)
 
 
+def _angles(colour: Colour, colours: UInt8[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Angles in linear light between a colour and others, which shading leaves alone; and both in linear light."""
+    given, found = (linear_colours(np.array(c, np.uint8).reshape(-1, 3)) for c in (colour, colours))
+    cosine = found @ given[0] / np.maximum(np.linalg.norm(found, axis=1) * np.linalg.norm(given[0]), 1e-9)
+    return np.arccos(np.clip(cosine, -1, 1)), given, found
+
+
+def _with_rare(materials: list[Colour], paints: Sequence[Colour], seen: UInt8[np.ndarray, "n 3"]) -> list[Colour]:
+    """The materials, and those of the given paints that are too rare among the colours of printed cloth to be one."""
+    found = list(materials)
+    for paint in paints:
+        if found and _angles(paint, np.array(found, np.uint8))[0].min() <= 2 * MODE_DISTANCE:
+            continue
+        like = seen[_angles(paint, seen)[0] <= MODE_DISTANCE]
+        if len(like) >= LEAST_PAINT * len(seen):
+            red, green, blue = (int(channel) for channel in np.median(like, axis=0))
+            found.append((red, green, blue))
+    return found
+
+
 def _among(colour: Colour, materials: Sequence[Colour], source: str, role: str) -> int:
     """The material that a colour someone gave stands for; shading may have changed its brightness."""
-    given, found = (linear_colours(np.array(c, np.uint8).reshape(-1, 3)) for c in (colour, materials))
-    cosine = found @ given[0] / np.maximum(np.linalg.norm(found, axis=1) * np.linalg.norm(given[0]), 1e-9)
-    angle = np.arccos(np.clip(cosine, -1, 1))
+    angle, given, found = _angles(colour, np.array(materials, np.uint8))
     best = int(np.argmin(angle + 0.02 * np.abs(np.log((found.sum(axis=1) + 1e-4) / (given.sum() + 1e-4)))))
     if angle[best] > 2 * MODE_DISTANCE:
         raise ColoursNotSeparableError(
