@@ -127,6 +127,20 @@ def test_a_given_colour_says_which_is_the_garment() -> None:
     assert angle_to(found.paints[0], paint) < 0.15
 
 
+def test_a_given_paint_may_be_rarer_than_any_colour() -> None:
+    """Two in a thousand vertices wear it, in one patch; prints have so many colours that no more are left of it."""
+    scan = dressed_tube("blue", 6)
+    cloth, paint, _, _ = PALETTES["blue"]
+    worn = np.array([angle_to(tuple(colour), paint) < 0.1 for colour in scan.colours.tolist()])
+    places = scan.mesh.vertices[worn]
+    far = np.linalg.norm(places - places[0], axis=1).argsort()[round(0.002 * len(worn)) :]
+    colours = scan.colours.copy()
+    colours[np.flatnonzero(worn)[far]] = cloth
+    found = learn_colours([replace(scan, colours=colours)], garment=cloth, paints=(paint,))
+    assert angle_to(found.paints[0], paint) < 0.15
+    assert angle_to(found.garment, cloth) < 0.1
+
+
 def test_without_paint_the_garment_has_the_most_neighbours() -> None:
     found = learn_colours([dressed_tube("red", 7, painted=False, bare=False)])
     assert found.paints == ()
