@@ -60,13 +60,13 @@ class Export(_Alone):
                 print(f"capture4d: {line}", file=sys.stderr)
         elif not formats:
             formats = [default_format()]
-            if formats == ["glb"]:
-                print("capture4d: writing GLB; pip install 'capture4d[usd]' makes USD the default", file=sys.stderr)
         done = pipeline.export(
             self.work, formats, self.output, self.config, frames=self.frames, overwrite=self.overwrite
         )
         for note in done.notes:
             print(f"capture4d: {self.work}: {note}", file=sys.stderr)
+        if not self.all and not self.format and formats == ["glb"]:
+            print("capture4d: wrote GLB; pip install 'capture4d[usd]' makes USD the default", file=sys.stderr)
         for each in done.written:
             print(f"export: {each.file}: {done.result.frames} frames, {_error(each.error_mm, each.fit, each.targets)}")
         broken = [f"{each.file}: {'; '.join(each.faults)}" for each in done.written if each.faults]
