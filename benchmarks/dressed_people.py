@@ -32,14 +32,30 @@ from data_synth.scanner.config import FusionConfig, NoiseConfig, RigConfig, Scan
 from data_synth.scanner.rig import bounding_sphere, scanner_rig
 from data_synth.scanner.scan import LABEL_GARMENT, Surface, scan_surfaces
 
-__all__ = ["HELD_OUT", "PEOPLE", "SUBJECTS", "Clothes", "PeoplePair", "Person", "make_pair", "standing", "way_to"]
+__all__ = [
+    "MORE",
+    "PEOPLE",
+    "SUBJECTS",
+    "Clothes",
+    "PeoplePair",
+    "Person",
+    "draw_people",
+    "draw_shape",
+    "make_pair",
+    "standing",
+    "way_to",
+]
 
 VERSION = 4
 """Of what is kept in the user's cache; raise it when these pairs change."""
 SUBJECTS: tuple[tuple[float, ...], ...] = ((0.0, 0.0), (1.3, -1.2), (-1.2, 1.3), (0.6, 1.8, 0.8), (-0.8, -1.0, -1.0))
 """Shape coefficients: height, girth, a third."""
 OTHERS: tuple[tuple[float, ...], ...] = ((0.7, -0.6, 1.0), (-0.6, 0.5, -0.4), (1.0, 1.1, 0.0))
-"""The same of people on whom no setting is chosen; they are numbered on from `SUBJECTS`."""
+"""The same of the people of `MORE`; they are numbered on from `SUBJECTS`."""
+DRAWN = ((0.14, 100_000), (0.14, 10_000), (0.06, 100_000), (0.14, 100_000), (0.14, 10_000), (0.02, 10_000))
+"""How far people who are drawn move, metres, and what their scans have of vertices."""
+MOST_SHAPE = 1.8
+"""Largest shape coefficient that is drawn."""
 TEMPLATE_VERTICES = 10_000
 NOISE_M = 0.001
 LENGTH_SWEEPS = 200
@@ -59,10 +75,12 @@ class Person:
     scan_vertices: int
     """10,000: closed, by Poisson reconstruction; 100,000: fused from depth cameras, with holes."""
     seed: int
+    drawn: tuple[float, ...] = ()
+    """The shape of one who is none of the numbered subjects."""
 
     @property
     def shape(self) -> tuple[float, ...]:
-        return (*SUBJECTS, *OTHERS)[self.subject]
+        return self.drawn or (*SUBJECTS, *OTHERS)[self.subject]
 
     @property
     def name(self) -> str:
@@ -81,7 +99,7 @@ PEOPLE: tuple[Person, ...] = (
     Person(3, 0.14, 100_000, 9),
     Person(4, 0.06, 10_000, 10),
 )
-HELD_OUT: tuple[Person, ...] = (
+MORE: tuple[Person, ...] = (
     Person(5, 0.14, 100_000, 11),
     Person(6, 0.14, 10_000, 12),
     Person(7, 0.14, 100_000, 13),
@@ -91,7 +109,24 @@ HELD_OUT: tuple[Person, ...] = (
     Person(5, 0.14, 100_000, 17),
     Person(6, 0.14, 100_000, 18),
 )
-"""Looked at once a setting has been chosen on `PEOPLE`."""
+"""Others, of whom the far ones have chosen settings as well."""
+
+
+def draw_people(seed: int) -> tuple[Person, ...]:
+    """People of whom nobody knows yet: shapes, clothes, poses and noise are all drawn, four of six at 140 mm.
+
+    A seed whose results have chosen a setting is held out no more.
+    """
+    rng = np.random.default_rng([VERSION, 1000, seed])
+    return tuple(
+        Person(index, motion_m, vertices, 1000 * (seed + 1) + index, draw_shape(rng))
+        for index, (motion_m, vertices) in enumerate(DRAWN)
+    )
+
+
+def draw_shape(rng: np.random.Generator) -> tuple[float, ...]:
+    """Height, girth and a third coefficient."""
+    return tuple(np.clip(rng.standard_normal(3), -MOST_SHAPE, MOST_SHAPE).round(2).tolist())
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,7 +13,7 @@ import time
 import numpy as np
 from rich.console import Console
 
-from benchmarks.dressed_people import HELD_OUT, PEOPLE, PeoplePair, make_pair
+from benchmarks.dressed_people import MORE, PEOPLE, PeoplePair, draw_people, make_pair
 from benchmarks.metric import Metric
 from benchmarks.painted_shirts import make_shirt
 from benchmarks.peers import run_peer
@@ -30,10 +30,15 @@ BAD_MM, FINE_MM = 30.0, 10.0
 """A mean correspondence above the first has to be called failed, one below the second must not."""
 
 
-def measure_people(*, quick: bool) -> list[Metric]:
-    """Whole dressed people, ours and trimesh's nricp from the same start; one peer's pair if quick. People on whom no
-    setting was chosen are told by themselves."""
-    people = [PEOPLE[1], PEOPLE[4]] if quick else [*PEOPLE, *HELD_OUT]
+def measure_people(*, quick: bool, seed: int | None = None) -> list[Metric]:
+    """Whole dressed people, ours and trimesh's nricp from the same start; one peer's pair if quick or drawn.
+
+    Args:
+        seed: of people who are drawn, in place of those on whom settings were chosen.
+    """
+    people = [PEOPLE[1], PEOPLE[4]] if quick else [*PEOPLE, *MORE]
+    if seed is not None:
+        people = list(draw_people(seed))[: 2 if quick else None]
     rows, wrong = [], 0
     peer: list[list[float]] = []
     for number, person in enumerate(people):
@@ -56,10 +61,10 @@ def measure_people(*, quick: bool) -> list[Metric]:
             )
             peer.append([*_errors(pair, answer.vertices), answer.cpu_s])
     table, others = np.array(rows, float), np.array(peer)
-    chosen_on = np.array([person in PEOPLE for person in people])
-    metrics = _people_metrics(table[chosen_on], "")
-    if not quick:
-        metrics += _people_metrics(table[~chosen_on], "held_out_")
+    more = np.array([person in MORE for person in people])
+    metrics = _people_metrics(table[~more], "")
+    if more.any():
+        metrics += _people_metrics(table[more], "more_")
     return [
         *metrics,
         Metric("wrong_verdicts", float(wrong)),
@@ -92,11 +97,16 @@ def _errors(pair: PeoplePair, vertices: np.ndarray) -> tuple[float, float]:
     return float(1e3 * correspondence.mean()), float(1e3 * there.mean())
 
 
-def measure_borders(*, quick: bool) -> list[Metric]:
-    """Shirts with painted borders."""
+def measure_borders(*, quick: bool, seed: int | None = None) -> list[Metric]:
+    """Shirts with painted borders.
+
+    Args:
+        seed: of shirts that are drawn, on people who are drawn, in place of those on which settings were chosen.
+    """
     rows, wrong = [], 0
-    for seed in range(2 if quick else 10):
-        shirt = make_shirt(seed)
+    first = 0 if seed is None else 1000 * (seed + 1)
+    for number in range(first, first + (2 if quick else 10)):
+        shirt = make_shirt(number, drawn=seed is not None)
         config = MeshRegistrationConfig(border_colour=shirt.paint, units="m")
         begin = time.process_time()
         result = register_mesh(
@@ -127,10 +137,15 @@ def _wrong(verdict: str, correspondence_mm: float) -> bool:
     return failed != (correspondence_mm > BAD_MM) and not FINE_MM <= correspondence_mm <= BAD_MM
 
 
-def measure_hopeless(*, quick: bool) -> list[Metric]:
-    """Pairs that do not belong together: how many of them are called failed, or refused."""
-    person, other = make_pair(PEOPLE[1]), make_pair(PEOPLE[9])
-    shirt = make_shirt(0)
+def measure_hopeless(*, quick: bool, seed: int | None = None) -> list[Metric]:
+    """Pairs that do not belong together: how many of them are called failed, or refused.
+
+    Args:
+        seed: of a person, another and a shirt that are drawn.
+    """
+    drawn = None if seed is None else draw_people(seed)
+    person, other = (make_pair(each) for each in ((PEOPLE[1], PEOPLE[9]) if drawn is None else drawn[1:3]))
+    shirt = make_shirt(0) if seed is None else make_shirt(1000 * (seed + 1), drawn=True)
     pairs = {
         "half the size": (person.template, _about(person.scan, 0.5 * np.eye(3))),
         "a shirt for a person": (person.template, shirt.scan),

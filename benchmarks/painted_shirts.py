@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from benchmarks.dressed_people import SUBJECTS, Clothes, standing, way_to
+from benchmarks.dressed_people import SUBJECTS, Clothes, draw_shape, standing, way_to
 from capture4d.body.anny import load_anny
 from capture4d.body.skinning import with_shape
 from capture4d.geometry.mesh import boundary_loops, connected_components
@@ -49,10 +49,15 @@ class PaintedShirt:
     """The template's loops under the same names."""
 
 
-def make_shirt(seed: int) -> PaintedShirt:
-    """One shirt, in 2 to 4 CPU seconds."""
+def make_shirt(seed: int, *, drawn: bool = False) -> PaintedShirt:
+    """One shirt, in 2 to 4 CPU seconds.
+
+    Args:
+        drawn: of somebody whose shape is drawn, too.
+    """
     rng = np.random.default_rng([7, seed])
-    clothes = Clothes.tailor(with_shape(load_anny(), np.array(SUBJECTS[seed % len(SUBJECTS)])), rng)
+    shape = draw_shape(rng) if drawn else SUBJECTS[seed % len(SUBJECTS)]
+    clothes = Clothes.tailor(with_shape(load_anny(), np.array(shape)), rng)
     first, last = standing(clothes.shaped, rng), random_pose(clothes.shaped, rng)
     before, after = way_to(clothes, first, last, rng.uniform(0.015, 0.05))
     faces = _cut(clothes, rng)

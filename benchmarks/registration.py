@@ -105,6 +105,7 @@ def run(
     compared: int = 6,
     workers: int = 2,
     capture: Path | None = None,
+    seed: int | None = None,
 ) -> list[Metric]:
     """Register a take, and single frames of it with every method.
 
@@ -115,10 +116,12 @@ def run(
         compared: frames on which all methods start from the same place.
         workers: processes that make the take; registration itself is measured in one.
         capture: capture folder with truth to measure on instead of the cached synthetic take.
+        seed: of people and shirts that are drawn, in place of those on which settings were chosen (people, borders,
+            hopeless).
     """
     pairs = {"people": measure_people, "borders": measure_borders, "hopeless": measure_hopeless}
     if data in pairs:
-        return pairs[data](quick=quick)
+        return pairs[data](quick=quick, seed=seed)
     if data == "faces":
         return _faces(2 if quick else len(FACES))
     if data == "printed":
