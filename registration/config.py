@@ -24,7 +24,6 @@ __all__ = [
     "PAPER",
     "PRESETS",
     "SOFT",
-    "STIFF",
     "ApproachConfig",
     "BoundaryConfig",
     "CoarseConfig",
@@ -39,6 +38,7 @@ __all__ = [
     "ScanFitConfig",
     "Schedule",
     "SequenceConfig",
+    "SettleConfig",
 ]
 
 BoundaryRule = Literal["argmax", "nearest", "mean", "none"]
@@ -312,14 +312,25 @@ PAIR = RegistrationConfig(
 """Two meshes of one thing: the folds of one are no folds of the other, so that the shape is held more firmly than in a
 take. The softer schedule of takes ends 3 mm farther off (people, 140 mm)."""
 
-STIFF = RegistrationConfig(
-    data=DataConfig(normals="both", smoothing_passes=4, unshrunk=True),
-    dense=DenseConfig(
-        cold=Schedule(12, (0.03, 0.012), smooth=(300.0, 3.0), stretch=(10.0, 0.03), boundary=(0.3, 0.05)),
-        plasticity=0.0,
-    ),
-)
-"""After the way from afar: limbs turn and slide into their places with the shape that they have."""
+
+@settings
+class SettleConfig:
+    """After the way from afar: limbs turn and slide into their places with the shape that the template has."""
+
+    steps: Count = 12
+    """Gauss-Newton steps; correspondences are renewed before each."""
+    gate: tuple[Positive, Positive] = (0.03, 0.012)
+    """Distance gate of the data term, metres, first and last step."""
+    bending: tuple[NonNegative, NonNegative] = (300.0, 3.0)
+    """Weight of how far vertices are off their neighbourhoods as the template has them, turned as they lie."""
+    stretch: tuple[NonNegative, NonNegative] = (10.0, 0.03)
+    """Weight of lengths along edges against the template's."""
+    boundary: tuple[NonNegative, NonNegative] = (0.3, 0.05)
+    """Weight of E_bound."""
+    polish: Schedule = Schedule(
+        4, (0.012, 0.012), smooth=(20.0, 0.2), stretch=(10.0, 0.03), anchor=(0.1, 0.02), boundary=(0.3, 0.05)
+    )
+    """The vertex by vertex stage after these steps. What has settled hardly slides any more."""
 
 
 @settings
@@ -414,8 +425,8 @@ class MeshRegistrationConfig:
     reached so."""
     registration: RegistrationConfig = PAIR
     """Settings where lengths are kept, for a template whose diagonal is 1.2 m."""
-    stiff: RegistrationConfig = STIFF
-    """Settings between the way there from afar and the dense stage of these."""
+    settle: SettleConfig = SettleConfig()
+    """Settings of what follows on the way there from afar."""
     soft: RegistrationConfig = SOFT
     """Settings where lengths are free."""
     approach: ApproachConfig = ApproachConfig()

@@ -21,7 +21,15 @@ from scipy.sparse import csgraph
 from capture4d.geometry.mesh import connected_components, unique_edges
 from registration.solver import Rows
 
-__all__ = ["DeformationGraph", "build_graph", "identity_nodes", "node_edge_rows", "rows_of_vertices", "smooth_rows"]
+__all__ = [
+    "DeformationGraph",
+    "build_graph",
+    "identity_nodes",
+    "node_edge_rows",
+    "rows_of_vertices",
+    "smooth_rows",
+    "surface_graph",
+]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,7 +60,7 @@ def build_graph(
     Every part of a template in several parts gets at least one node. Vertices without faces follow the nearest node in
     space.
     """
-    distances_between = _surface_graph(vertices, faces)
+    distances_between = surface_graph(vertices, faces)
     parts = connected_components(faces, len(vertices)) if len(faces) else np.zeros(len(vertices), np.int32)
     sampled = _farthest_points(distances_between, _part_seeds(parts, faces), min(nodes, len(vertices)))
     distance = csgraph.dijkstra(distances_between, directed=False, indices=sampled)
@@ -120,7 +128,7 @@ def node_edge_rows(graph: DeformationGraph) -> tuple[Rows, Int32[np.ndarray, "pa
     return Rows(offsets, pairs.reshape(-1).astype(np.int32), coefficients.reshape(-1, 4)), pairs
 
 
-def _surface_graph(vertices: np.ndarray, faces: np.ndarray) -> sparse.csr_array:
+def surface_graph(vertices: np.ndarray, faces: np.ndarray) -> sparse.csr_array:
     """Edges, and the two corners across each inner edge: shorter detours, so distances closer to the geodesic."""
     count = len(vertices)
     pairs = unique_edges(faces)

@@ -2,8 +2,10 @@
 
 In this order, until the scan is reached:
 
-    near       as a garment of the frame before: coarse, then vertex by vertex, with lengths kept
-    far        drawn there as a whole first (`approach`), then vertex by vertex, stiffly and less so
+    near       as a garment of the frame before: coarse, then vertex by vertex, with lengths kept; after the next one
+               where limbs of the scan are out of reach
+    far        drawn there as a whole first (`approach`), settled in its shape (`settle`), limbs that turned about
+               themselves turned back (`untwisted`), then vertex by vertex
 
 Where `align` may, and a rigid motion brings the template far nearer, both are tried from there as well; from there
 alone if nothing of the scan lies near the start. Then:
@@ -32,8 +34,10 @@ from registration.approach import approach, spread_evenly
 from registration.config import MeshRegistrationConfig, RegistrationConfig, ScanFitConfig
 from registration.correspondences import mesh_normals
 from registration.geodesic_signature import Likeness, geodesic_signatures, likeness
+from registration.limb_twist import untwisted
 from registration.quality import FrameQuality, assess, scan_distances
 from registration.register import FrameScan, prepare_frame, register_frame
+from registration.settling import settle
 from registration.template import TemplateAnalysis, analyse_template
 
 __all__ = ["Landmarks", "MeshFit", "fit_mesh", "judge"]
@@ -47,6 +51,9 @@ NORMAL_LENGTH = 0.03
 FARTHEST = 0.1
 """Beyond this, metres, one is as far off as another."""
 SAMPLES = 4000
+LIMB_AWAY, AWAY_SHARE = 0.06, 0.1
+"""Where more than this share of the scan is farther than this from the template, metres, the way from nearby is tried
+after the one from afar, if at all."""
 BETTER = 0.8
 """A freer attempt has to bring the misfit down to this share, or lengths stay kept."""
 CLEARLY = 0.6
@@ -218,8 +225,9 @@ def _keeping_lengths(tried: _Attempts, start: np.ndarray, landmarks: Landmarks |
         there = approach(
             analysis, scan.surface, begin, config.approach, first_width=width, signatures=told, landmarks=landmarks
         )
-        settled = register_frame(analysis, scan, there, config=_dense_alone(config.stiff)).vertices
-        return register_frame(analysis, scan, settled, config=_dense_alone(own)).vertices
+        settled = _settled(tried, there)
+        polish = replace(own, dense=replace(own.dense, cold=config.settle.polish))
+        return register_frame(analysis, scan, settled, config=_dense_alone(polish)).vertices
 
     def far(begin: np.ndarray) -> bool:
         return tried.add("far", begin, lambda: drawn(begin, None, tried.signatures))
@@ -227,11 +235,14 @@ def _keeping_lengths(tried: _Attempts, start: np.ndarray, landmarks: Landmarks |
     movable = config.align == "auto" and landmarks is None
     if config.lengths == "free":
         return _moved_there(start, scan) if movable else start
+    swinging = landmarks is None and _limbs_are_away(start, scan)
+    if swinging and far(start):
+        return start
     if landmarks is None and near(start):
         return start
     elsewhere = tried.fault is not None
     moved = _moved_there(start, scan) if movable and elsewhere else start
-    if moved is start and far(start):
+    if moved is start and not swinging and far(start):
         return start
     if tried.fault is not None and config.align == "none":
         raise tried.fault
@@ -244,6 +255,24 @@ def _keeping_lengths(tried: _Attempts, start: np.ndarray, landmarks: Landmarks |
         tried.add("wide", start, lambda: drawn(start, config.approach.wider, None))
         return start
     return moved
+
+
+def _settled(tried: _Attempts, there: np.ndarray) -> np.ndarray:
+    """The template settled on the scan, and once more with its limbs turned back, if that brings it nearer."""
+    analysis, scan, config = tried.kept, tried.scan, tried.config
+    settled = settle(analysis, scan, there, config.settle, config.registration)
+    turned = untwisted(analysis, scan.surface, settled)
+    if turned is None:
+        return settled
+    again = settle(analysis, scan, turned, config.settle, config.registration)
+    return min(settled, again, key=lambda vertices: _misfit(analysis, scan, vertices))
+
+
+def _limbs_are_away(start: np.ndarray, scan: FrameScan) -> bool:
+    """Whether most of the scan lies around the template, but limbs of it beyond what is reached from nearby."""
+    points = scan.surface.points
+    away = KDTree(start).query(points[spread_evenly(points, SAMPLES)])[0]
+    return float((away > LIMB_AWAY).mean()) > AWAY_SHARE and float(np.median(away)) < LIMB_AWAY
 
 
 def _resized(tried: _Attempts, start: np.ndarray) -> None:

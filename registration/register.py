@@ -39,7 +39,15 @@ from registration.fold_lengths import folded_lengths
 from registration.solver import Rows, RowTerm, SmoothTerm, Term, gauss_newton_step
 from registration.template import TemplateAnalysis, require_borders
 
-__all__ = ["FrameRegistration", "FrameScan", "prepare_frame", "register_frame"]
+__all__ = [
+    "FrameRegistration",
+    "FrameScan",
+    "anneal",
+    "border_terms",
+    "data_term",
+    "prepare_frame",
+    "register_frame",
+]
 
 PART_EDGES = 2.5
 """Cloth farther away than so many mean edges at rest is another part of the template."""
@@ -158,12 +166,12 @@ def _coarse_stage(
     vertices = start
     for step in range(schedule.steps):
         at = (step, schedule.steps)
-        terms = [_data_term(analysis, data_rows, scan.surface, vertices, subset, anneal(schedule.gate, *at), config)]
+        terms = [data_term(analysis, data_rows, scan.surface, vertices, subset, anneal(schedule.gate, *at), config)]
         if step == 0 and not terms[0].metric.any():
             raise InputError(
                 f"frame {scan.frame_id}: expected scan vertices within {schedule.gate[0]:g} m of the start, found none"
             )
-        terms += _border_terms(
+        terms += border_terms(
             analysis, border_rows, scan, vertices, anneal(schedule.boundary, *at), config.boundary.gate,
             rule=config.boundary.coarse_rule, along_curve=False,
         )  # fmt: skip
@@ -213,8 +221,8 @@ def _dense_stage(
     for step in range(steps):
         at = (step, steps)
         gate = anneal(schedule.gate, *at)
-        terms: list[Term] = [_data_term(analysis, analysis.vertex_rows, scan.surface, vertices, every, gate, config)]
-        terms += _border_terms(
+        terms: list[Term] = [data_term(analysis, analysis.vertex_rows, scan.surface, vertices, every, gate, config)]
+        terms += border_terms(
             analysis, border_rows, scan, vertices, anneal(schedule.boundary, *at), config.boundary.gate,
             rule=config.boundary.dense_rule, along_curve=config.boundary.along_curve,
         )  # fmt: skip
@@ -252,7 +260,7 @@ def _dense_stage(
     return vertices, iterations
 
 
-def _data_term(
+def data_term(
     analysis: TemplateAnalysis,
     rows: Rows,
     surface: ScanSurface,
@@ -282,7 +290,7 @@ def _data_term(
     return RowTerm(rows, metric, points - found.points)
 
 
-def _border_terms(
+def border_terms(
     analysis: TemplateAnalysis,
     rows: Rows,
     scan: FrameScan,
@@ -293,6 +301,7 @@ def _border_terms(
     rule: BoundaryRule,
     along_curve: bool,
 ) -> list[RowTerm]:
+    """Pull the template's borders to the painted points; nothing where there are none."""
     border = analysis.border
     positions = vertices[border.vertices]
     targets: BorderTargets = border_targets(

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from capture4d.geometry.mesh import submesh
 from capture4d.types import GarmentScan, Mesh
 from registration import mesh_fit
-from registration.config import MeshRegistrationConfig, ScanFitConfig
+from registration.config import MeshRegistrationConfig, ScanFitConfig, SettleConfig
 from registration.correspondences import mesh_normals
 from registration.mesh_fit import judge
 from registration.quality import assess
@@ -76,7 +76,9 @@ def test_where_nothing_lies_near_the_way_from_afar_starts_from_a_rigid_motion_al
     rest = garment.template.vertices.astype(np.float64)
     few = replace(config, dense=replace(config.dense, cold=replace(config.dense.cold, steps=1)))
     few = replace(few, coarse=replace(config.coarse, cold=replace(config.coarse.cold, steps=1)))
-    mesh_fit.fit_mesh(garment, scan, rest, MeshRegistrationConfig(lengths="kept", registration=few, stiff=few))
+    mesh_fit.fit_mesh(
+        garment, scan, rest, MeshRegistrationConfig(lengths="kept", registration=few, settle=SettleConfig(steps=1))
+    )
     assert starts
     assert np.allclose(starts[0], rest) == (off_m == 0.0)
     for start in starts:
