@@ -27,7 +27,8 @@ from data_synth.cloth.fabrics import Fabric
 from data_synth.cloth.patterns import PanelMesh, locate, smooth_noise
 from data_synth.cloth.stencils import hinges, rest_lengths
 from data_synth.cloth.tailoring import Made, Sleeve, Wall, bending_factors, shrunk, wall_heights, walls
-from data_synth.cloth.tightening import tighten
+from data_synth.cloth.tightening import flatten, lengthen, tighten
+from data_synth.cloth.untangling import Room, untangle
 from data_synth.config import RelaxationConfig
 
 __all__ = [
@@ -78,11 +79,12 @@ class WrinkleMesh:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Finish:
-    """What a frame's folds end with: sweeps over nearly unbent cloth."""
+    """What a frame's folds end with: sweeps over nearly unbent cloth, and steps that part what cuts itself."""
 
     sweeps: int
     bending: float
     over_relaxation: float
+    untangle_steps: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -275,10 +277,13 @@ def relax_frame(
             (sweeps + 1) // 2,
         )
     if level.finish is not None:
+        room = Room(
+            base.astype(np.float32), 1.2 * config.radius_m, plane_points, plane_normals, config.body_margin_m
+        )
         tighten(
             points,
-            base.astype(np.float32),
-            np.float32(1.2 * config.radius_m),
+            room.base,
+            np.float32(room.radius),
             mesh.edges,
             mesh.rest_lengths,
             np.float32(level.finish.over_relaxation),
@@ -287,8 +292,11 @@ def relax_frame(
             np.float32(level.finish.bending),
             plane_points,
             plane_normals,
-            np.float32(config.body_margin_m),
+            np.float32(room.margin),
             level.finish.sweeps,
+        )
+        points = untangle(
+            points, mesh.faces, mesh.edges, mesh.rest_lengths, room, steps=level.finish.untangle_steps
         )
     planes = body.planes(points[near])
     depth = np.einsum("vc,vc->v", points[near] - planes.points, planes.normals) - 0.2 * config.body_margin_m
@@ -341,17 +349,7 @@ def _relax(
     one, half = np.float32(1), np.float32(0.5)
     for sweep in range(sweeps):
         forward = sweep % 2 == 0
-        for q in range(len(hinges)):
-            e = q if forward else len(hinges) - 1 - q
-            a, b, c, d = hinges[e, 0], hinges[e, 1], hinges[e, 2], hinges[e, 3]
-            wa, wb, wc, wd = weights[e, 0], weights[e, 1], weights[e, 2], weights[e, 3]
-            gain = bend * weights[e, 4]
-            for k in range(3):
-                bent = gain * (wa * x[a, k] + wb * x[b, k] + wc * x[c, k] + wd * x[d, k])
-                x[a, k] -= wa * bent
-                x[b, k] -= wb * bent
-                x[c, k] -= wc * bent
-                x[d, k] -= wd * bent
+        flatten(x, hinges, weights, bend, forward)
         for i in range(len(x)):
             nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
             ox, oy, oz = x[i, 0] - base[i, 0], x[i, 1] - base[i, 1], x[i, 2] - base[i, 2]
@@ -373,16 +371,4 @@ def _relax(
                 py -= depth * plane_normals[i, 1]
                 pz -= depth * plane_normals[i, 2]
             x[i, 0], x[i, 1], x[i, 2] = px, py, pz
-        for q in range(len(edges)):
-            e = q if forward else len(edges) - 1 - q
-            i, j = edges[e, 0], edges[e, 1]
-            dx, dy, dz = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
-            size = np.sqrt(dx * dx + dy * dy + dz * dz) + np.float32(1e-9)
-            move = half * (one - lengths[e] / size)
-            dx, dy, dz = dx * move, dy * move, dz * move
-            x[i, 0] += dx
-            x[i, 1] += dy
-            x[i, 2] += dz
-            x[j, 0] -= dx
-            x[j, 1] -= dy
-            x[j, 2] -= dz
+        lengthen(x, edges, lengths, half, forward)
