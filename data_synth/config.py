@@ -156,10 +156,17 @@ class FoldConfig:
     """Sweeps over nearly unbent cloth at the end, in which it gets its lengths back."""
     last_bending: Share = 0.005
     """Bending gain in them."""
-    untangle_steps: Whole = 12
-    """Steps, on each mesh, in which faces that cut each other are drawn apart; 0 leaves them."""
     over_relaxation: Annotated[float, Range(least=1, below=2)] = 1.2
     """Of the lengths in them."""
+    slack: Share = 1.0
+    """Share of a correction that an edge gets in them that is too long: cloth buckles before it is compressed."""
+    untangle_steps: Whole = 12
+    """Steps, on each mesh of folds, in which faces that cut each other are drawn apart; 0 leaves them."""
+    sheet_steps: Whole = 4
+    """The same after every simulated frame of the sheet: what has only just passed through itself parts easily."""
+    sideways: Share = 0.1
+    """How firmly the sheet keeps its area, as a share of its stiffness. At 1 it shrinks across by a third of what it is
+    stretched along, as jersey does, and what has shrunk does not fold."""
     hold_spread: Whole = 25
     """Passes over the simulated sheet that smooth which limbs its hold follows. Where the skin folds sharply, above a
     raised shoulder, cloth does not."""

@@ -167,7 +167,7 @@ def _folded(
         mesh = wrinkle_mesh(meshes["coarse"], meshes["fine"], config.relaxation, rng)
         return None, (Level(mesh, fabric, config.relaxation),)
     made = {name: Made(tailor(mesh, pattern, folds), folds) for name, mesh in meshes.items() if name != "template"}
-    finish = Finish(folds.last_sweeps, folds.last_bending, folds.over_relaxation, folds.untangle_steps)
+    finish = Finish(folds.last_sweeps, folds.last_bending, folds.over_relaxation, folds.slack, folds.untangle_steps)
     soft = replace(fabric, fold_bending=folds.wide_bending)
     left = 1 - folds.wide_share
     wide = wrinkle_mesh(

@@ -13,9 +13,9 @@ from capture4d.geometry.point_grid import PointGrid
 from capture4d.heavy_imports import njit
 
 __all__ = [
+    "along3",
     "closest_in_triangle",
     "closest_on_faces",
-    "along3",
     "count_intersecting_faces",
     "cross3",
     "difference3",

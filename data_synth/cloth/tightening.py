@@ -31,8 +31,9 @@ def flatten(x, hinges, weights, bend, forward):
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def lengthen(x, edges, lengths, gain, forward):
-    """One sweep over the edges, (E, 2): the ends of each go by the gain, a half for all of it, towards its length."""
+def lengthen(x, edges, lengths, gain, slack, forward):
+    """One sweep over the edges, (E, 2): the ends of each go by the gain, a half for all of it, towards its length; those
+    of one that is too long by the share `slack` of that."""
     one = np.float32(1)
     for q in range(len(edges)):
         e = q if forward else len(edges) - 1 - q
@@ -40,6 +41,8 @@ def lengthen(x, edges, lengths, gain, forward):
         dx, dy, dz = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
         size = np.sqrt(dx * dx + dy * dy + dz * dz) + np.float32(1e-9)
         move = gain * (one - lengths[e] / size)
+        if move > 0:
+            move *= slack
         dx, dy, dz = dx * move, dy * move, dz * move
         x[i, 0] += dx
         x[i, 1] += dy
@@ -50,11 +53,12 @@ def lengthen(x, edges, lengths, gain, forward):
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def tighten(x, base, radius, edges, lengths, over, hinges, weights, bend, planes, plane_normals, margin, sweeps):
+def tighten(x, base, radius, edges, lengths, over, slack, hinges, weights, bend, planes, plane_normals, margin, sweeps):
     """Project the edges, (E, 2), of points x, (V, 3) float32, to their lengths, in place; within `radius` of `base`.
 
     Args:
         over: over-relaxation of an edge's correction, 1 to 2; the last three sweeps are at 1.
+        slack: share of it for an edge that is too long, 0 to 1.
         bend: gain of the hinges, as in `_relax`.
         planes: points, (V, 3), of half planes that no vertex comes nearer to than the margin, and their normals.
     """
@@ -76,4 +80,4 @@ def tighten(x, base, radius, edges, lengths, over, hinges, weights, bend, planes
             if depth < 0:
                 for k in range(3):
                     x[i, k] -= depth * plane_normals[i, k]
-        lengthen(x, edges, lengths, half * (over if sweep < sweeps - 3 else one), forward)
+        lengthen(x, edges, lengths, half * (over if sweep < sweeps - 3 else one), slack, forward)

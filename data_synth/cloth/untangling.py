@@ -1,11 +1,11 @@
 """Cloth that has passed through itself is drawn back, without knowing how it got there.
 
-Where two faces cut each other, an edge of one pierces the other, and the cut runs on from there into the face behind the
-edge. Moved against each other in the direction in which the cut shortens fastest, they part where cloth has only just
-passed through cloth; layers that lie in each other over a hand's breadth do not.
+Where two faces cut each other, an edge of one pierces the other, and the cut runs on from there into the face behind
+the edge. Moved against each other in the direction in which the cut shortens fastest, they part where cloth has only
+just passed through cloth; layers that lie in each other over a hand's breadth do not.
 
 References: Volino and Magnenat-Thalmann, Resolving Surface Collisions through Intersection Contour Minimization
-(SIGGRAPH 2006); the gradient here is that of the cut's length on the one face.
+(SIGGRAPH 2006); a face's share of the gradient here is that of the cut's length on it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from data_synth.cloth.tightening import tighten
 
 __all__ = ["Room", "untangle"]
 
-RINGS = 5
+RINGS = 3
 """Around faces that cut each other so many rings of cloth give way."""
 SWEEPS = 3
 """Over the lengths of that cloth after each step."""
@@ -92,6 +92,7 @@ def untangle(
             np.float32(here.radius),
             part_edges,
             part_lengths,
+            np.float32(1),
             np.float32(1),
             none,
             no_weights,

@@ -45,6 +45,8 @@ __all__ = [
 
 FOLD_ROOM_M = 0.015
 """Cloth as near to the plane between arm and trunk stays on its side of it."""
+RAISED_RINGS, RAISED_SWEEPS = 3, 20
+"""So many rings around a turned layer give way to its thickness, in as many sweeps."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,6 +86,7 @@ class Finish:
     sweeps: int
     bending: float
     over_relaxation: float
+    slack: float = 1.0
     untangle_steps: int = 0
 
 
@@ -211,11 +214,23 @@ def relax_levels(
     for number, level in enumerate(levels):
         sheet, offset = relax_frame(level, sheet, surface, None if previous is None else previous[number], between)
         offsets.append(offset)
-    raised = levels[-1].mesh.raised
-    if raised is not None:
-        outwards = vertex_normals(sheet.astype(np.float64), levels[-1].mesh.faces)
-        sheet = (sheet + raised[:, None] * outwards).astype(np.float32)
-    return sheet, offsets
+    return _raised(levels[-1].mesh, sheet, 1.0 if levels[-1].finish is None else levels[-1].finish.slack), offsets
+
+
+def _raised(mesh: WrinkleMesh, sheet: np.ndarray, slack: float) -> np.ndarray:
+    """The sheet, (V, 3), with its turned layers standing out, at its own lengths."""
+    if mesh.raised is None:
+        return sheet
+    outwards = vertex_normals(sheet.astype(np.float64), mesh.faces)
+    sheet = (sheet + mesh.raised[:, None] * outwards).astype(np.float32)
+    near = mesh.raised > 0
+    for _ in range(RAISED_RINGS):
+        near[mesh.edges[near[mesh.edges].any(axis=1)]] = True
+    inner = near[mesh.edges].all(axis=1)
+    edges, lengths = mesh.edges[inner], mesh.rest_lengths[inner]
+    for sweep in range(RAISED_SWEEPS):
+        lengthen(sheet, edges, lengths, np.float32(0.5), np.float32(slack), sweep % 2 == 0)
+    return sheet
 
 
 def lift_levels(levels: Sequence[Level], coarse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -277,9 +292,7 @@ def relax_frame(
             (sweeps + 1) // 2,
         )
     if level.finish is not None:
-        room = Room(
-            base.astype(np.float32), 1.2 * config.radius_m, plane_points, plane_normals, config.body_margin_m
-        )
+        room = Room(base.astype(np.float32), 1.2 * config.radius_m, plane_points, plane_normals, config.body_margin_m)
         tighten(
             points,
             room.base,
@@ -287,6 +300,7 @@ def relax_frame(
             mesh.edges,
             mesh.rest_lengths,
             np.float32(level.finish.over_relaxation),
+            np.float32(level.finish.slack),
             mesh.hinges,
             mesh.hinge_weights,
             np.float32(level.finish.bending),
@@ -295,9 +309,7 @@ def relax_frame(
             np.float32(room.margin),
             level.finish.sweeps,
         )
-        points = untangle(
-            points, mesh.faces, mesh.edges, mesh.rest_lengths, room, steps=level.finish.untangle_steps
-        )
+        points = untangle(points, mesh.faces, mesh.edges, mesh.rest_lengths, room, steps=level.finish.untangle_steps)
     planes = body.planes(points[near])
     depth = np.einsum("vc,vc->v", points[near] - planes.points, planes.normals) - 0.2 * config.body_margin_m
     points[near] -= (np.minimum(depth, 0)[:, None] * planes.normals).astype(np.float32)
@@ -371,4 +383,4 @@ def _relax(
                 py -= depth * plane_normals[i, 1]
                 pz -= depth * plane_normals[i, 2]
             x[i, 0], x[i, 1], x[i, 2] = px, py, pz
-        lengthen(x, edges, lengths, half, forward)
+        lengthen(x, edges, lengths, half, one, forward)
