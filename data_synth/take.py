@@ -167,14 +167,18 @@ def _folded(
         mesh = wrinkle_mesh(meshes["coarse"], meshes["fine"], config.relaxation, rng)
         return None, (Level(mesh, fabric, config.relaxation),)
     made = {name: Made(tailor(mesh, pattern, folds), folds) for name, mesh in meshes.items() if name != "template"}
-    finish = Finish(folds.last_sweeps, folds.last_bending, folds.over_relaxation)
+    finish = Finish(folds.last_sweeps, folds.last_bending, folds.over_relaxation, folds.slack, folds.untangle_steps)
     soft = replace(fabric, fold_bending=folds.wide_bending)
     left = 1 - folds.wide_share
     wide = wrinkle_mesh(
         meshes["coarse"], meshes["wide"], folds.wide, rng, fabric=soft, made=made["wide"], excess_left=left
     )
     fine = wrinkle_mesh(meshes["wide"], meshes["fine"], config.relaxation, rng, fabric=fabric, made=made["fine"])
-    return made["coarse"], (Level(wide, soft, folds.wide, finish), Level(fine, fabric, config.relaxation, finish))
+    # Folds remember for as long, whatever share of the simulated frames is captured.
+    wide_folds, fine_folds = (
+        replace(each, warm_start=each.warm_start**config.capture_every) for each in (folds.wide, config.relaxation)
+    )
+    return made["coarse"], (Level(wide, soft, wide_folds, finish), Level(fine, fabric, fine_folds, finish))
 
 
 def _paint(config: SynthConfig, fine: PanelMesh, shaped: ShapedBody) -> Paint:

@@ -13,10 +13,16 @@ from capture4d.geometry.point_grid import PointGrid
 from capture4d.heavy_imports import njit
 
 __all__ = [
+    "along3",
     "closest_in_triangle",
     "closest_on_faces",
     "count_intersecting_faces",
+    "cross3",
+    "difference3",
+    "dot3",
     "fan_distances",
+    "intersecting_pairs",
+    "segment_cuts",
     "self_intersections",
 ]
 
@@ -30,20 +36,37 @@ def self_intersections(
     vertices: Float64[np.ndarray, "verts 3"], faces: Integer[np.ndarray, "faces 3"]
 ) -> Bool[np.ndarray, " faces"]:
     """Which faces cut another face they share no vertex with."""
+    return intersecting_faces(vertices, faces, *_cells_of_faces(vertices, faces))
+
+
+def intersecting_pairs(
+    vertices: Float64[np.ndarray, "verts 3"], faces: Integer[np.ndarray, "faces 3"]
+) -> Integer[np.ndarray, "pairs 2"]:
+    """The pairs of faces that cut each other and share no vertex, each once."""
+    return pairs_of_faces(vertices, faces, *_cells_of_faces(vertices, faces))
+
+
+def _cells_of_faces(
+    vertices: np.ndarray, faces: np.ndarray
+) -> tuple[np.ndarray, float, np.ndarray, float, tuple[int, int, int], np.ndarray, np.ndarray]:
+    """Centres of faces, how far apart those of faces that cut each other can be, and the grid of the centres."""
     corners = vertices[faces]
     centre = corners.mean(axis=1)
     offsets = corners - centre[:, None]
     reach = np.sqrt(np.einsum("fca,fca->fc", offsets, offsets).max(axis=1))
     radius = 2.0 * float(np.percentile(reach, 99))
     cells = PointGrid.build(centre, radius)
-    return intersecting_faces(
-        vertices, faces, centre, radius, cells.origin, cells.cell, cells.shape, cells.starts, cells.order
-    )
+    return centre, radius, cells.origin, cells.cell, cells.shape, cells.starts, cells.order
 
 
 @njit(cache=True, inline="always")
 def dot3(u, v):
     return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
+
+
+@njit(cache=True, inline="always")
+def cross3(u, v):
+    return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
 
 
 @njit(cache=True, inline="always")
@@ -159,7 +182,29 @@ def intersecting_faces(vertices, faces, centres, radius, origin, cell, shape, st
 
     The last five are of a `PointGrid` of the centres.
     """
-    count = len(faces)
+    cut = np.zeros(len(faces), np.bool_)
+    _search_cuts(vertices, faces, centres, radius, origin, cell, shape, starts, order, cut, np.empty((0, 2), np.int64))
+    return cut
+
+
+@njit(cache=True)
+def pairs_of_faces(vertices, faces, centres, radius, origin, cell, shape, starts, order):
+    """The same, pair by pair."""
+    cut, pairs = np.zeros(len(faces), np.bool_), np.empty((1024, 2), np.int64)
+    while True:
+        count = _search_cuts(vertices, faces, centres, radius, origin, cell, shape, starts, order, cut, pairs)
+        if count <= len(pairs):
+            return pairs[:count]
+        pairs = np.empty((2 * count, 2), np.int64)
+
+
+@njit(cache=True)
+def _search_cuts(vertices, faces, centres, radius, origin, cell, shape, starts, order, cut, pairs):
+    """Mark faces that cut each other; write the pairs, as many as there is room for, and count them.
+
+    Without room for any, faces that are marked are not tested against each other.
+    """
+    count, found = len(faces), 0
     low, high, centre = np.empty((count, 3)), np.empty((count, 3)), np.empty((count, 3))
     place = np.empty((count, 3), np.int64)
     for n in range(count):  # in the order of the cells, so that neighbours lie beside each other in memory
@@ -168,7 +213,6 @@ def intersecting_faces(vertices, faces, centres, radius, origin, cell, shape, st
             a, b, c = vertices[faces[f, 0], axis], vertices[faces[f, 1], axis], vertices[faces[f, 2], axis]
             low[n, axis], high[n, axis], centre[n, axis] = min(a, b, c), max(a, b, c), centres[f, axis]
             place[n, axis] = min(np.int64((centres[f, axis] - origin[axis]) / cell), shape[axis] - 1)
-    cut = np.zeros(count, np.bool_)
     for n in range(count):
         first, last = max(place[n, 2] - 1, 0), min(place[n, 2] + 1, shape[2] - 1)
         for i in range(place[n, 0], min(place[n, 0] + 2, shape[0])):
@@ -185,9 +229,14 @@ def intersecting_faces(vertices, faces, centres, radius, origin, cell, shape, st
                     for axis in range(3):
                         away += (centre[n, axis] - centre[m, axis]) ** 2
                     f, g = order[n], order[m]
-                    if away <= radius**2 and not (cut[f] and cut[g]) and faces_cut(vertices, faces[f], faces[g]):
+                    if away > radius**2 or (len(pairs) == 0 and cut[f] and cut[g]):
+                        continue
+                    if faces_cut(vertices, faces[f], faces[g]):
                         cut[f] = cut[g] = True
-    return cut
+                        if found < len(pairs):
+                            pairs[found, 0], pairs[found, 1] = f, g
+                        found += 1
+    return found
 
 
 @njit(cache=True)

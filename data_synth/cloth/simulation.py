@@ -18,16 +18,19 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation, Slerp
 
-from capture4d.body.binding import WEIGHT_SMOOTHING, bind
-from capture4d.body.skinning import PosedBody, ShapedBody, skin, unskin, with_pose
-from capture4d.geometry.mesh import unique_edges, vertex_adjacency, vertex_normals
+from capture4d.body.skinning import PosedBody, ShapedBody, with_pose
+from capture4d.geometry.mesh import unique_edges
 from capture4d.geometry.ray_casting import TriangleScene
+from capture4d.geometry.triangles import count_intersecting_faces
 from capture4d.heavy_imports import import_warp
 from capture4d.types import PoseSequence
 from data_synth.cloth.fabrics import Fabric
+from data_synth.cloth.holding import Hold, Walls
 from data_synth.cloth.panels import Pattern
-from data_synth.cloth.patterns import PanelMesh, smooth_noise
-from data_synth.cloth.tailoring import Made, Sleeve, Wall, bending_factors, wall_heights, walls
+from data_synth.cloth.patterns import PanelMesh
+from data_synth.cloth.stencils import rest_lengths
+from data_synth.cloth.tailoring import Made, bending_factors, shrunk
+from data_synth.cloth.untangling import Room, untangle
 from data_synth.config import SimulationConfig
 
 __all__ = ["approach_poses", "clear_of_body", "dress", "dressing_rotations", "simulate"]
@@ -37,10 +40,10 @@ DRESSING_ARM_RAISE_DEG = 42.0
 
 LIFT_M = 0.035
 """The panels start this far above their place, clear of the shoulders."""
-WALL_MARGIN_M = 0.005
-"""Room that sleeve and trunk keep to the plane between them, for the folds of both."""
-WALL_OPENING = 0.125
-"""How fast that room grows from the underarm downwards."""
+BODY_MARGIN_M = 0.002
+"""Room that the sheet keeps to the body."""
+UNTANGLE_M = 0.01
+"""Farthest that a vertex moves in one frame to part from cloth that it has passed through."""
 PILLOW_M = 0.13
 """Distance from the seams over which front and back part."""
 
@@ -232,19 +235,18 @@ def simulate(
     state, scratch = model.state(), model.state()
     step = 1 / config.fps / config.substeps
     gravity = np.array([0.0, -9.81, 0.0], np.float32)
-    hold: _Hold | None = None
+    hold: Hold | None = None
     yield start
     current = bodies[0].vertices()
     for frame in range(1, len(bodies)):
         previous, current = current, bodies[frame].vertices()
         if frame == config.calm_frames and config.hold_hz > 0:
             cloth = state.particle_q.numpy().astype(np.float64)
-            spread = 0 if made is None else made.folds.hold_spread
             masses = model.particle_mass.numpy()
-            hold = _Hold.take(mesh, cloth, bodies[frame - 1], masses, config, spread=spread, held_from=held_from)
+            hold = Hold.take(mesh, cloth, bodies[frame - 1], masses, config, made=made, held_from=held_from)
         held = None if hold is None else (hold.places(bodies[frame - 1]), hold.places(bodies[frame]))
         calm = frame <= config.calm_frames
-        between = _Walls.of(made, bodies[frame], model.particle_mass.numpy())
+        between = Walls.of(made, bodies[frame], model.particle_mass.numpy())
         model.set_gravity(tuple(gravity * (0.5 if calm else 1.0)))
         for substep in range(config.substeps):
             blend = (substep + 1) / config.substeps
@@ -266,92 +268,24 @@ def simulate(
             state, scratch = scratch, state
             keep = config.calm_damping if calm else config.damping
             state.particle_qd.assign(state.particle_qd.numpy() * np.float32(keep))
+        if made is not None and not calm:
+            parted = _untangled(mesh, made, state.particle_q.numpy(), current, bodies[0].shaped.body.template.faces)
+            state.particle_q.assign(parted)
         yield state.particle_q.numpy().astype(np.float64)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Hold:
-    """Soft springs from the cloth to where it sat on the body when it was put on.
-
-    They stand for what keeps a worn shirt in place, the seams and the stiffness of the yoke, and they are why a take
-    depends on the pose and hardly on how it was reached: where friction lets the cloth stick, and where it buckles
-    when the arms go up, a free sheet has as many answers as histories. The places are bumpy, always in the same way,
-    and so decide how the cloth buckles.
-    """
-
-    rest: np.ndarray
-    """(V, 3) in the body's rest pose, metres."""
-    skin_weights: np.ndarray
-    """(V, J)."""
-    stiffness: np.ndarray
-    """(V, 1) spring constants, N/m."""
-
-    @staticmethod
-    def take(
-        mesh: PanelMesh,
-        cloth: np.ndarray,
-        body: PosedBody,
-        masses: np.ndarray,
-        config: SimulationConfig,
-        *,
-        spread: int,
-        held_from: float | None,
-    ) -> _Hold:
-        """Hold the cloth, (V, 3) with limbs well apart, where it is on the body now; firmest at the shoulders, or from
-        another height upwards.
-
-        Args:
-            spread: passes that smooth the skin weights over the cloth.
-            held_from: that height in the rest pose, metres; None: that of the shoulders.
-        """
-        # Diffused over a coarse sheet, weights would let the thighs turn a waistband.
-        _, _, weights = bind(cloth, mesh.faces, body, smoothing=WEIGHT_SMOOTHING if held_from is None else 0)
-        adjacency = vertex_adjacency(mesh.faces, mesh.vertex_count).astype(np.float64)
-        around = np.asarray(adjacency.sum(axis=1)).reshape(-1, 1)
-        for _ in range(spread):
-            weights = 0.5 * weights + 0.5 * (adjacency @ weights) / around
-        rest, flagged = unskin(cloth, weights, body.transforms)
-        assert not flagged.any(), "the dressing pose cannot be unposed"
-        bumps = smooth_noise(mesh.noise_uv, config.hold_ripple_m, config.hold_ripple_width_m, np.random.default_rng(1))
-        if held_from is None:
-            held_from = float(body.shaped.joints[body.shaped.body.joint_names.index("upperarm01.L")][1])
-        below = np.maximum(held_from - rest[:, 1], 0) / config.hold_depth_m
-        share = config.hold_floor + (1 - config.hold_floor) * np.exp(-(below**2))
-        rest = rest + bumps[:, None] * vertex_normals(rest, mesh.faces)
-        return _Hold(rest, weights, ((2 * np.pi * config.hold_hz) ** 2 * share * masses)[:, None])
-
-    def places(self, body: PosedBody) -> np.ndarray:
-        """Where the springs end in a pose, (V, 3) metres."""
-        return skin(self.rest, self.skin_weights, body.transforms)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Walls:
-    """Soft planes between the arms of one pose and the trunk: a sleeve stays on its own side, the trunk on the other.
-
-    They stand in for contact of cloth with cloth where it shows most.
-    """
-
-    sleeves: tuple[Sleeve, ...]
-    planes: tuple[Wall, ...]
-    stiffness: np.ndarray
-    """(V,) N/m."""
-
-    @staticmethod
-    def of(made: Made | None, body: PosedBody, masses: np.ndarray) -> _Walls | None:
-        if made is None or not made.folds.wall_hz:
-            return None
-        sleeves = made.tailoring.sleeves
-        return _Walls(sleeves, walls(sleeves, body), (2 * np.pi * made.folds.wall_hz) ** 2 * masses)
-
-    def push(self, points: np.ndarray, forces: np.ndarray) -> None:
-        """Add to forces, (V, 3) N, what drives cloth at some points, (V, 3), back to its side."""
-        for sleeve, wall in zip(self.sleeves, self.planes, strict=True):
-            heights, below = wall_heights(points, sleeve, wall)
-            depth = np.minimum(WALL_MARGIN_M, WALL_OPENING * below) - heights
-            deep = (below > 0) & (depth > 0)
-            rows, away = sleeve.rows[deep], (sleeve.signs * depth)[deep]
-            forces[rows] += (self.stiffness[rows] * away)[:, None] * wall.normal
+def _untangled(
+    mesh: PanelMesh, made: Made, points: np.ndarray, surface: np.ndarray, body_faces: np.ndarray
+) -> np.ndarray:
+    """The sheet, (V, 3) float32, where faces of it that cut each other have been drawn apart, outside of the body."""
+    if not made.folds.sheet_steps or not count_intersecting_faces(points.astype(np.float64), mesh.faces):
+        return points
+    edges, lengths = rest_lengths(shrunk(mesh, made.tailoring.scale))
+    _, foot, normals = _Surface(TriangleScene((surface, body_faces))).heights(points)
+    room = Room(points, UNTANGLE_M, foot.astype(np.float32), normals.astype(np.float32), BODY_MARGIN_M)
+    return untangle(
+        points, mesh.faces, edges.astype(np.int32), lengths.astype(np.float32), room, steps=made.folds.sheet_steps
+    )
 
 
 def _build_model(
@@ -371,7 +305,7 @@ def _build_model(
         indices=mesh.faces.ravel().tolist(),
         density=fabric.density,
         tri_ke=fabric.stretch_stiffness,
-        tri_ka=fabric.stretch_stiffness,
+        tri_ka=fabric.stretch_stiffness * (1 if made is None else made.folds.sideways),
         tri_kd=1e-3,
         edge_ke=fabric.coarse_bending,
         edge_kd=1e-3,
@@ -400,7 +334,7 @@ def _build_model(
     builder.particle_mass = mass.tolist()
     faces = bodies[0].shaped.body.template.faces
     body = newton.Mesh(bodies[0].vertices().astype(np.float32), faces.ravel(), compute_inertia=False)
-    builder.add_shape_mesh(body=-1, mesh=body, cfg=newton.ModelBuilder.ShapeConfig(margin=0.002))
+    builder.add_shape_mesh(body=-1, mesh=body, cfg=newton.ModelBuilder.ShapeConfig(margin=BODY_MARGIN_M))
     builder.color(include_bending=True)
     model = builder.finalize(device="cpu")
     model.soft_contact_ke, model.soft_contact_kd, model.soft_contact_mu = 1e4, 1e-3, fabric.friction

@@ -27,7 +27,8 @@ from data_synth.cloth.fabrics import Fabric
 from data_synth.cloth.patterns import PanelMesh, locate, smooth_noise
 from data_synth.cloth.stencils import hinges, rest_lengths
 from data_synth.cloth.tailoring import Made, Sleeve, Wall, bending_factors, shrunk, wall_heights, walls
-from data_synth.cloth.tightening import tighten
+from data_synth.cloth.tightening import flatten, lengthen, tighten
+from data_synth.cloth.untangling import Room, untangle
 from data_synth.config import RelaxationConfig
 
 __all__ = [
@@ -44,6 +45,8 @@ __all__ = [
 
 FOLD_ROOM_M = 0.015
 """Cloth as near to the plane between arm and trunk stays on its side of it."""
+RAISED_RINGS, RAISED_SWEEPS = 3, 20
+"""So many rings around a turned layer give way to its thickness, in as many sweeps."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,11 +81,13 @@ class WrinkleMesh:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Finish:
-    """What a frame's folds end with: sweeps over nearly unbent cloth."""
+    """What a frame's folds end with: sweeps over nearly unbent cloth, and steps that part what cuts itself."""
 
     sweeps: int
     bending: float
     over_relaxation: float
+    slack: float = 1.0
+    untangle_steps: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -209,11 +214,23 @@ def relax_levels(
     for number, level in enumerate(levels):
         sheet, offset = relax_frame(level, sheet, surface, None if previous is None else previous[number], between)
         offsets.append(offset)
-    raised = levels[-1].mesh.raised
-    if raised is not None:
-        outwards = vertex_normals(sheet.astype(np.float64), levels[-1].mesh.faces)
-        sheet = (sheet + raised[:, None] * outwards).astype(np.float32)
-    return sheet, offsets
+    return _raised(levels[-1].mesh, sheet, 1.0 if levels[-1].finish is None else levels[-1].finish.slack), offsets
+
+
+def _raised(mesh: WrinkleMesh, sheet: np.ndarray, slack: float) -> np.ndarray:
+    """The sheet, (V, 3), with its turned layers standing out, at its own lengths."""
+    if mesh.raised is None:
+        return sheet
+    outwards = vertex_normals(sheet.astype(np.float64), mesh.faces)
+    sheet = (sheet + mesh.raised[:, None] * outwards).astype(np.float32)
+    near = mesh.raised > 0
+    for _ in range(RAISED_RINGS):
+        near[mesh.edges[near[mesh.edges].any(axis=1)]] = True
+    inner = near[mesh.edges].all(axis=1)
+    edges, lengths = mesh.edges[inner], mesh.rest_lengths[inner]
+    for sweep in range(RAISED_SWEEPS):
+        lengthen(sheet, edges, lengths, np.float32(0.5), np.float32(slack), sweep % 2 == 0)
+    return sheet
 
 
 def lift_levels(levels: Sequence[Level], coarse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -275,21 +292,24 @@ def relax_frame(
             (sweeps + 1) // 2,
         )
     if level.finish is not None:
+        room = Room(base.astype(np.float32), 1.2 * config.radius_m, plane_points, plane_normals, config.body_margin_m)
         tighten(
             points,
-            base.astype(np.float32),
-            np.float32(1.2 * config.radius_m),
+            room.base,
+            np.float32(room.radius),
             mesh.edges,
             mesh.rest_lengths,
             np.float32(level.finish.over_relaxation),
+            np.float32(level.finish.slack),
             mesh.hinges,
             mesh.hinge_weights,
             np.float32(level.finish.bending),
             plane_points,
             plane_normals,
-            np.float32(config.body_margin_m),
+            np.float32(room.margin),
             level.finish.sweeps,
         )
+        points = untangle(points, mesh.faces, mesh.edges, mesh.rest_lengths, room, steps=level.finish.untangle_steps)
     planes = body.planes(points[near])
     depth = np.einsum("vc,vc->v", points[near] - planes.points, planes.normals) - 0.2 * config.body_margin_m
     points[near] -= (np.minimum(depth, 0)[:, None] * planes.normals).astype(np.float32)
@@ -341,17 +361,7 @@ def _relax(
     one, half = np.float32(1), np.float32(0.5)
     for sweep in range(sweeps):
         forward = sweep % 2 == 0
-        for q in range(len(hinges)):
-            e = q if forward else len(hinges) - 1 - q
-            a, b, c, d = hinges[e, 0], hinges[e, 1], hinges[e, 2], hinges[e, 3]
-            wa, wb, wc, wd = weights[e, 0], weights[e, 1], weights[e, 2], weights[e, 3]
-            gain = bend * weights[e, 4]
-            for k in range(3):
-                bent = gain * (wa * x[a, k] + wb * x[b, k] + wc * x[c, k] + wd * x[d, k])
-                x[a, k] -= wa * bent
-                x[b, k] -= wb * bent
-                x[c, k] -= wc * bent
-                x[d, k] -= wd * bent
+        flatten(x, hinges, weights, bend, forward)
         for i in range(len(x)):
             nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
             ox, oy, oz = x[i, 0] - base[i, 0], x[i, 1] - base[i, 1], x[i, 2] - base[i, 2]
@@ -373,16 +383,4 @@ def _relax(
                 py -= depth * plane_normals[i, 1]
                 pz -= depth * plane_normals[i, 2]
             x[i, 0], x[i, 1], x[i, 2] = px, py, pz
-        for q in range(len(edges)):
-            e = q if forward else len(edges) - 1 - q
-            i, j = edges[e, 0], edges[e, 1]
-            dx, dy, dz = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
-            size = np.sqrt(dx * dx + dy * dy + dz * dz) + np.float32(1e-9)
-            move = half * (one - lengths[e] / size)
-            dx, dy, dz = dx * move, dy * move, dz * move
-            x[i, 0] += dx
-            x[i, 1] += dy
-            x[i, 2] += dz
-            x[j, 0] -= dx
-            x[j, 1] -= dy
-            x[j, 2] -= dz
+        lengthen(x, edges, lengths, half, one, forward)

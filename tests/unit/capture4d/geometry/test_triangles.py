@@ -8,6 +8,7 @@ from capture4d.geometry.triangles import (
     closest_on_faces,
     count_intersecting_faces,
     fan_distances,
+    intersecting_pairs,
 )
 
 
@@ -87,3 +88,15 @@ def test_intersections_equal_brute_force() -> None:
     cut = {f for f in range(count) for g in range(count) if f != g and (pierces(f, g) or pierces(g, f))}
     assert 5 < len(cut) < count
     assert count_intersecting_faces(vertices, faces) == len(cut)
+    pairs = {(f, g) for f in range(count) for g in range(f) if pierces(f, g) or pierces(g, f)}
+    found = intersecting_pairs(vertices, faces)
+    assert len(found) == len(pairs)
+    assert {(max(pair), min(pair)) for pair in found.tolist()} == pairs
+
+
+def test_no_pair_is_lost_where_there_are_many() -> None:
+    """Each of forty slats across forty others."""
+    across = np.arange(40)[:, None, None] * [1.0, 0, 0] + [[0.0, -2, 0], [0, 90, 0.1], [0, -2, 0.2]]
+    along = np.arange(40)[:, None, None] * [0, 1.0, 0] + [[-2.0, 0, -0.5], [-2, 0, 0.7], [90, 0, 0.1]]
+    vertices = np.concatenate([across, along]).reshape(-1, 3)
+    assert len(intersecting_pairs(vertices, np.arange(240).reshape(-1, 3))) == 1600
