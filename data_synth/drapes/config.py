@@ -126,7 +126,7 @@ CLOTHS: dict[str, Cloth] = {
 HOLDS: dict[str, Hold] = {
     "tshirt": Hold(hz=10.0, depth_m=0.09, floor=0.07),
     "shirt": Hold(hz=10.0, depth_m=0.09, floor=0.07),
-    "trousers": Hold(hz=40.0, depth_m=0.04, floor=0.02),
+    "trousers": Hold(hz=40.0, depth_m=0.04, floor=0.01),
     "skirt": Hold(hz=25.0, depth_m=0.04, floor=0.0),
     "necktie": Hold(hz=0.0, depth_m=0.04, floor=0.0),
 }
