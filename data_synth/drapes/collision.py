@@ -105,10 +105,19 @@ class Wearing:
     ) -> np.ndarray:
         """The body vertex under each contact, (C,) int32, of a garment at some points, (V, 3), by looking at all."""
         start = np.empty(len(contacts[0]), np.int32)
+        corners = surface.vertices[parts.faces]
+        middles = corners.mean(axis=1)
         for part, inside in enumerate(parts.inside):
-            rows, candidates = np.flatnonzero(contacts[1] == part), np.flatnonzero(inside)
-            if len(rows):
-                start[rows] = candidates[KDTree(surface.vertices[candidates]).query(points[contacts[0][rows]])[1]]
+            rows = np.flatnonzero(contacts[1] == part)
+            if not len(rows):
+                continue
+            here = points[contacts[0][rows]]
+            own, own_faces = np.flatnonzero(inside), np.flatnonzero(parts.part_faces[part])
+            # Middles of faces as well: where skin is near skin, the nearest vertex may be of the other side.
+            found = KDTree(np.concatenate([surface.vertices[own], middles[own_faces]])).query(here)[1]
+            face = own_faces[np.maximum(found - len(own), 0)]
+            corner = np.linalg.norm(corners[face] - here[:, None], axis=2).argmin(axis=1)
+            start[rows] = np.where(found < len(own), own[np.minimum(found, len(own) - 1)], parts.faces[face, corner])
         return start
 
     def begin_again(self, points: np.ndarray, surface: Surface) -> None:

@@ -126,7 +126,7 @@ CLOTHS: dict[str, Cloth] = {
 HOLDS: dict[str, Hold] = {
     "tshirt": Hold(hz=10.0, depth_m=0.09, floor=0.07),
     "shirt": Hold(hz=10.0, depth_m=0.09, floor=0.07),
-    "trousers": Hold(hz=40.0, depth_m=0.04, floor=0.02),
+    "trousers": Hold(hz=40.0, depth_m=0.04, floor=0.01),
     "skirt": Hold(hz=25.0, depth_m=0.04, floor=0.0),
     "necktie": Hold(hz=0.0, depth_m=0.04, floor=0.0),
 }
@@ -219,8 +219,10 @@ class DrapesConfig:
     style: tuple[str, ...] = ()
     """Of the garment, NAME=VALUE each: size, ease, and what else its pattern has."""
     beta: tuple[Number, ...] = ()
-    """Shape of the person, in standard deviations: the first is height, the second girth. The pattern is drafted for
-    the mean person whoever wears it."""
+    """Shape of the person, in standard deviations: the first is height, the second girth."""
+    drafted_for: Literal["mean", "wearer"] = "mean"
+    """Whom the pattern is drafted for: the mean person whoever wears it, as what is bought in one size, or the wearer,
+    as what is made to measure. The mesh is the same."""
     vertices: Vertices = 3000
     """Of the garment's mesh."""
     skirt_weights: Literal["distance", "root"] = "distance"

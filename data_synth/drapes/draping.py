@@ -20,14 +20,16 @@ from data_synth.cloth.panels import Pattern
 from data_synth.cloth.patterns import PanelMesh, grade
 from data_synth.drapes.collision import BodyParts, Wearing
 from data_synth.drapes.config import CLOTHS, HOLDS, STYLES, DrapesConfig, Hold, SolverConfig
-from data_synth.drapes.dressing import base_garment, mirrored
+from data_synth.drapes.dressing import base_garment, hung, mirrored
 from data_synth.drapes.garments import GARMENTS, PINNED_M, Garment, panel_vertices, parse_style
-from data_synth.drapes.solver import FRAME_SUBSTEPS, SUBSTEP_S, Planes, Sheet, advance
+from data_synth.drapes.solver import FRAME_SUBSTEPS, SUBSTEP_S, Planes, Sheet, advance, keep_lengths
 
 __all__ = ["Drape", "Draper", "part_contacts", "symmetric_person"]
 
 CLOSING_FRAMES, CLOSING_KEEP = 60, 0.95
 """In which panels hung around the body come to lie on it, and the share of the velocity that a substep leaves then."""
+OUT_PASSES = 6
+"""At the end, of edges kept within their limits and vertices pushed out of the body."""
 WEIGHT_SMOOTHING = 20
 """Further diffusion steps on skin weights: places that bend over a wider stretch do not crumple what they hold."""
 OFFSET_SMOOTHING = 12
@@ -71,17 +73,21 @@ class Draper:
         kind, mean = GARMENTS[config.garment], symmetric_person(with_shape(body, np.zeros(0)))
         self.config, self.style = config, parse_style(config.garment, config.style)
         base = base_garment(config.garment, mean, config.vertices, config.garment_seed)
-        graded = kind.draft(mean, self.style)
+        wearer = symmetric_person(with_shape(body, np.array(config.beta))) if any(config.beta) else mean
+        to_measure = config.drafted_for == "wearer"
+        graded = kind.draft(wearer if to_measure else mean, self.style)
         self.pattern: Pattern = graded
         self.mesh: PanelMesh = grade(base.mesh, base.pattern, graded)
         self.person: ShapedBody = mean
         own = _Fitting(self, kind, base.mesh, mean)
         worn = own.put_on(base.hung)
-        if self.style != STYLES[config.garment]():
+        if self.style != STYLES[config.garment]() and not (to_measure and any(config.beta)):
             own = _Fitting(self, kind, self.mesh, mean)
-            worn = own.put_on(worn.vertices)
+            # What is pinned stays as wide as it is hung: a necktie of another width is hung anew.
+            start = hung(config.garment, self.mesh, graded, own.body) if kind.pinned else worn.vertices
+            worn = own.put_on(start)
         if any(config.beta):
-            self.person = symmetric_person(with_shape(body, np.array(config.beta)))
+            self.person = wearer
             moved = _moved(worn, self.mesh, mean, self.person)
             own = _Fitting(self, kind, self.mesh, self.person)
             posed = with_pose(self.person, kind.dressing(self.person), np.zeros(3))
@@ -231,7 +237,8 @@ class _Fitting:
             motion = 1e3 * float(np.linalg.norm(positions - before, axis=1).mean())
             frames += 1
         wearing.begin_again(positions, surface)
-        for _ in range(3):
+        for _ in range(OUT_PASSES):
+            keep_lengths(self.sheet, positions)
             positions = _pushed_out(positions, wearing.look_up(positions, surface), solver.margin_m / 2)
         return Drape(positions, frames, motion)
 
@@ -291,8 +298,8 @@ def _other_side(names: tuple[str, ...]) -> np.ndarray:
 def part_contacts(mesh: PanelMesh, panels: np.ndarray, kind: Garment) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and the part of the body each meets, (C,) int32.
 
-    It is one part for each, but for skirts: cloth that two parts squeeze between them is pushed from one into the other
-    and back, and ends as crushed and overstretched faces.
+    It is one part for each: cloth that two parts squeeze between them is pushed from one into the other and back, and
+    ends as crushed and overstretched faces.
     """
     parts = max(part for met in (*kind.meets.values(), (kind.seam,)) for part in met) + 1
     meets = np.zeros((mesh.vertex_count, parts), bool)

@@ -26,6 +26,9 @@ CUT_LIMIT_PERCENT = 15.0
 """Faces that cut the garment's own: cloth does not collide with cloth, and folds at armpit, groin and knee run through
 each other in every strongly bent pose; beyond this share something is turned inside out."""
 INSIDE_M = 1e-3
+ROOM_M = 5e-3
+"""Between skin and other skin nearer than this there is no room for cloth, which lies 2 to 4 mm over either: thigh and
+calf of a squat touch and run through each other, and what is between them cannot be outside both."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +41,8 @@ class DrapeQuality:
     stretch_p99: float
     """Edge length over rest length, 99th percentile."""
     inside_percent: float
-    """Vertices more than a millimetre inside the part of the body that they meet."""
+    """Vertices more than a millimetre inside the part of the body that they meet, but for those between skins that
+    touch."""
     cut_percent: float
     """Faces that cut another face of the garment."""
     frames: int
@@ -87,14 +91,15 @@ def inside_parts(
     """(V,) bool: vertices of a garment, (V, 3), more than a millimetre inside a part of the body that they meet.
 
     Inside the closed body, and behind the nearest skin of the part. A vertex of the trunk inside an arm is not counted:
-    it meets the trunk alone.
+    it meets the trunk alone. Nor is one at skin with other skin so near before it that there is no room for it.
 
     Args:
         masks: (P, B) bool, which vertices of the body belong to each part.
         contacts: the garment's vertices, and the part each meets, both (C,).
     """
     faces, surface = body.shaped.body.template.faces, body.vertices()
-    deep = TriangleScene((surface, faces)).signed_distances(points) < -INSIDE_M
+    scene = TriangleScene((surface, faces))
+    deep = scene.signed_distances(points) < -INSIDE_M
     inside, normals = np.zeros(len(points), bool), vertex_normals(surface, faces)
     for part, mask in enumerate(masks):
         chosen = contacts[0][contacts[1] == part]
@@ -107,5 +112,7 @@ def inside_parts(
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         offsets = points[chosen] - near.points
         depth = -np.einsum("nx,nx->n", offsets, normal)
-        inside[chosen] |= depth > np.maximum(INSIDE_M, BESIDE_COSINE * np.linalg.norm(offsets, axis=1))
+        own_inside = depth > np.maximum(INSIDE_M, BESIDE_COSINE * np.linalg.norm(offsets, axis=1))
+        touching = scene.signed_distances(near.points + ROOM_M * normal) < 0
+        inside[chosen] |= own_inside & ~touching
     return inside

@@ -25,7 +25,7 @@ from data_synth.cloth.patterns import PanelMesh
 from data_synth.cloth.stencils import hinges, rest_areas, rest_lengths
 from data_synth.drapes.config import Cloth
 
-__all__ = ["FRAME_SUBSTEPS", "SUBSTEP_S", "Planes", "Sheet", "advance"]
+__all__ = ["FRAME_SUBSTEPS", "SUBSTEP_S", "Planes", "Sheet", "advance", "keep_lengths"]
 
 SUBSTEP_S = 1 / 1440
 FRAME_SUBSTEPS = 24
@@ -155,6 +155,21 @@ def advance(
         keep,
         substeps,
     )
+
+
+def keep_lengths(sheet: Sheet, positions: np.ndarray) -> None:
+    """Move positions, (V, 3) float64 and changed in place, until edges are about within their limits: one sweep there,
+    one back."""
+    _keep_lengths(
+        positions, sheet.inverse_masses, sheet.edges, sheet.lengths, sheet.edge_firmness * (0, 1, 0),
+        *sheet.strain_limits,
+    )  # fmt: skip
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def _keep_lengths(x, inverse_mass, edges, lengths, firmness, shortest, longest):
+    _stretch(x, inverse_mass, edges, lengths, firmness, shortest, longest, True)
+    _stretch(x, inverse_mass, edges, lengths, firmness, shortest, longest, False)
 
 
 @njit(cache=True, fastmath=True, nogil=True, error_model="numpy")

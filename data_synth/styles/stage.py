@@ -37,7 +37,7 @@ from data_synth.styles.pairs import Pair, choose_prototypes, draw_test_pairs, gr
 
 __all__ = ["run"]
 
-SCHEMA = 1
+SCHEMA = 2
 FOLDER = "canonical"
 
 

@@ -8,7 +8,7 @@ import pytest
 from data_synth.cloth.panels import Edge, Panel, Pattern, line
 from data_synth.cloth.patterns import PanelMesh, mesh_pattern
 from data_synth.drapes.config import Cloth
-from data_synth.drapes.solver import FRAME_SUBSTEPS, Planes, Sheet, advance
+from data_synth.drapes.solver import FRAME_SUBSTEPS, Planes, Sheet, advance, keep_lengths
 
 CLOTH = Cloth()
 NOTHING = Planes(np.zeros(0, np.int32), np.zeros((0, 3)), np.zeros((0, 3)))
@@ -117,3 +117,20 @@ def test_an_edge_is_hardly_shorter_than_its_limit():
     end = run(sheet, start, NOTHING, frames=4)
     lengths = np.linalg.norm(end[sheet.edges[:, 1]] - end[sheet.edges[:, 0]], axis=1)
     assert (lengths / sheet.lengths).min() > 0.75
+
+
+def test_lengths_are_kept_within_their_limits_and_what_is_pinned_stays():
+    mesh = strip()
+    start = flat(mesh) + np.random.default_rng(2).normal(scale=2e-3, size=(mesh.vertex_count, 3))
+    top = np.flatnonzero(flat(mesh)[:, 1] > -1e-9)
+    sheet, points = Sheet.create(mesh, CLOTH, top), start.copy()
+    apart = []
+    for _ in range(4):
+        lengths = np.linalg.norm(points[sheet.edges[:, 1]] - points[sheet.edges[:, 0]], axis=1) / sheet.lengths
+        apart.append(np.maximum(lengths - CLOTH.strain_limit, CLOTH.compression_limit - lengths).clip(0).sum())
+        keep_lengths(sheet, points)
+    assert apart[0] > 3 * apart[1] > 9 * apart[3]
+    np.testing.assert_array_equal(points[top], start[top])
+    within = flat(mesh)
+    keep_lengths(sheet, within)
+    np.testing.assert_array_equal(within, flat(mesh))
