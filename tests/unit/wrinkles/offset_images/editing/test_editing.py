@@ -158,6 +158,16 @@ def test_the_commands_in_a_row(work: WorkFolder, tmp_path: Path, capsys) -> None
     assert 0.005 < moved.max() < 0.03
 
 
+def test_a_picture_whose_floats_were_clipped_is_refused(work: WorkFolder, drawn: Path) -> None:
+    """As a program writes it that takes floats for shares of white; a PNG has no such values."""
+    path = picture(drawn)
+    if path.suffix == ".png":
+        pytest.skip("a PNG holds whole numbers")
+    cv2.imwrite(str(path), np.clip(pixels(path), 0, 1))
+    with pytest.raises(InputError, match=r"front\.tif: .*has clipped them; draw with --format png"):
+        apply(drawn, work, RemovalConfig())
+
+
 def test_what_cannot_be_applied_is_told_in_one_line(work: WorkFolder, drawn: Path, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     for name, change, expected in (
