@@ -160,9 +160,8 @@ class RemovalConfig:
 class PredictOffsetsConfig:
     """Putting a garment that drapes have taught on a motion."""
 
-    longest: NonNegative = 0.0
-    """Edges are drawn together to this many times their length in the garment as it was put on; 0: they stay as long as
-    they come, for what stretches in the drapes is meant to."""
+    longest: NonNegative = 1.15
+    """Edges are drawn together to this many times their length on the pattern; 0: they stay as long as they come."""
     unlike_deg: NonNegative = 10.0
     """A pose farther than this from every learned pose is reported, unless drapes that chose the epoch were farther."""
     fps: Positive | None = None

@@ -31,7 +31,8 @@ from capture4d.files.atomic import file_digest
 from capture4d.files.outputs import require_apart
 from capture4d.files.records import save_body, save_garment, save_poses
 from capture4d.geometry.intersection_removal import IntersectionRemoval
-from capture4d.geometry.mesh import edge_lengths, edge_stretch, stretch_p99, unique_edges
+from capture4d.geometry.mesh import edge_stretch, flat_edge_lengths, stretch_p99, unique_edges
+from capture4d.geometry.uv_layout import require_uvs
 from capture4d.motions.motion_files import rate_note, read_motion, resample, same_rate, told
 from capture4d.runs.stage import StageResult, complete_record
 from capture4d.runs.workers import run_jobs
@@ -113,7 +114,7 @@ class _Dressed:
     person: ShapedBody
     edges: Int32[np.ndarray, "E 2"]
     lengths: Float64[np.ndarray, " E"]
-    """Of the garment as it was put on, metres."""
+    """On the pattern, metres: the garment as it was put on is crushed under the arms where they have been lowered."""
     removal: IntersectionRemoval
     worn: WornBody
 
@@ -125,7 +126,8 @@ class _Dressed:
         garment, person = known.parts.garment, with_shape(known.parts.body, known.parts.shape)
         at_rest = garment.template.vertices.astype(np.float64)
         edges = unique_edges(garment.template.faces)
-        lengths = edge_lengths(at_rest, edges)
+        # the pattern, in metres, is what UVs of drapes are
+        lengths = flat_edge_lengths(require_uvs(garment.template), garment.template.faces, edges)
         longest = config.longest or float("inf")
         removal = IntersectionRemoval(garment.template.faces, len(at_rest), lengths, longest, config.removal)
         assert garment.skin_weights is not None
