@@ -19,7 +19,7 @@ from torch import nn
 
 from benchmarks.learning_takes import learned_takes, registered_takes, training_set
 from benchmarks.metric import Metric
-from benchmarks.offset_drapes import drape_metrics
+from benchmarks.offset_drapes import Scale, drape_metrics, tie_metrics
 from benchmarks.registered_work import QUICK_TAKE, registered_work
 from capture4d.body.skinning import with_shape
 from capture4d.captures.work_folder import load_records, load_registration, open_work
@@ -46,7 +46,7 @@ class _Errors:
 def run(
     *,
     quick: bool = False,
-    data: Literal["takes", "drapes"] = "takes",
+    data: Literal["takes", "drapes", "drapes-middle", "neckties", "neckties-middle"] = "takes",
     train: tuple[Path, ...] = (),
     test: tuple[Path, ...] = (),
     folder: Path | None = None,
@@ -59,22 +59,26 @@ def run(
     Args:
         quick: nine frames of a small take to learn, three to test; images of 64 texels are learned, 256 measured. Of
             drapes 60, of which 37 are kept.
-        data: drapes are of a T-shirt, 5,000 of them, and are learned in parts that a second run takes over.
+        data: `drapes` are of a T-shirt, 5,000 of them, or, `-middle`, 384; `neckties` as many, or 192. They are learned
+            in parts that a second run takes over, from where it was stopped.
         train, test: work folders of one garment and subject; none: the clips of `tshirt-train`, registered from their
             scans with tracked bodies, and its held-out ones. Of several to learn from the last one chooses the epoch,
             of one its last ninth. Of drapes: a set to learn instead of the T-shirt's, `train` alone.
-        folder: keeps what is learned of drapes.
+        folder: keeps what is learned of drapes; the cache folder does, unless given.
         epochs, baseline_epochs: of the decoder, and of the baselines, whose epochs take a second.
     """
     if quick:
         epochs, baseline_epochs = 60, 60
-    if data == "drapes":
+    if data != "takes":
         if test or len(train) > 1:
             raise InputError("benchmarks offsets: expected one set of drapes as --train, whose own part is the test")
+        scale: Scale = "quick" if quick else "middle" if data.endswith("-middle") else "full"
+        drapes = train[0] if train else None
+        if data.startswith("neckties"):
+            return tie_metrics(scale=scale, drapes=drapes, folder=folder, epochs=epochs, workers=workers)
         return drape_metrics(
-            quick=quick, drapes=train[0] if train else None, folder=folder, epochs=epochs,
-            baseline_epochs=baseline_epochs, workers=workers,
-        )  # fmt: skip
+            scale=scale, drapes=drapes, folder=folder, epochs=epochs, baseline_epochs=baseline_epochs, workers=workers
+        )
     return _of_takes(
         quick=quick, train=train, test=test, epochs=epochs, baseline_epochs=baseline_epochs, workers=workers
     )

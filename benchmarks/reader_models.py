@@ -80,13 +80,8 @@ def _read_lstm(path: Path) -> Any:
 
 
 def _write_range(path: Path) -> None:
-    from retarget.regression.known_range import (
-        CoefficientRange,
-        ControlRange,
-        KnownRange,
-        PoseRange,
-        save_known_range,
-    )
+    from capture4d.captures.animations.known_poses import PoseRange
+    from retarget.regression.known_range import CoefficientRange, ControlRange, KnownRange, save_known_range
 
     layout = _layout()
     still = np.tile(np.array([0, 0, 0, 1], np.float32), (3, 2, 1))
@@ -136,6 +131,7 @@ def _read_offsets(path: Path) -> Any:
 
 def _write_styles(path: Path, *, method: str) -> None:
     """A model's folder; garment and body lie beside what is damaged."""
+    from capture4d.captures.animations.known_poses import PoseRange
     from capture4d.captures.drapes.style_sets import Ranges
     from retarget.mixture.config import NetworkConfig
     from retarget.mixture.heads import Head, PoseNumbers
@@ -144,7 +140,6 @@ def _write_styles(path: Path, *, method: str) -> None:
     from retarget.mixture.predictors import Ensemble, Mixture
     from retarget.mixture.styled_garment import Canonical, StyledGarment
     from retarget.mixture.training import made_network
-    from retarget.regression.known_range import PoseRange
 
     count, config = 3 * len(MESH.vertices), NetworkConfig(hidden=2)
     pose = PoseNumbers((1,), "axis-angle", np.zeros(3), np.ones(3))
@@ -168,6 +163,7 @@ def _read_styles(path: Path) -> Any:
 
 def _write_drape_offsets(path: Path) -> None:
     """A model of kernels; garment and body lie beside what is damaged."""
+    from capture4d.captures.animations.known_poses import PoseRange
     from wrinkles.offset_images.config import DrapeOffsetsConfig
     from wrinkles.offset_images.drape_model import ModelParts, save_model_parts
     from wrinkles.offset_images.kernels import PoseKernels
@@ -178,7 +174,8 @@ def _write_drape_offsets(path: Path) -> None:
     poses, dual, mean, components = (RNG.random(size, np.float32) for size in ((4, 18), (4, 2), (27,), (2, 27)))
     kernels = PoseKernels(poses, dual, mean, components, 1.0, 0.1)
     config = DrapeOffsetsConfig(network="kernels", texels=64)
-    parts = ModelParts(config, garment, BODY, np.zeros(2, np.float32), NAMES[1:3], None, kernels, None)
+    learned = PoseRange(np.tile(np.array([0, 0, 0, 1], np.float32), (4, 2, 1)), (1, 2), 5.0)
+    parts = ModelParts(config, garment, BODY, np.zeros(2, np.float32), NAMES[1:3], None, kernels, None, learned)
     save_model_parts(path.parent, parts)
 
 

@@ -16,12 +16,13 @@ from rich.console import Console
 from benchmarks.learning_takes import Lesson, lesson, training_set, true_take
 from benchmarks.metric import Metric
 from capture4d.body.skinning import ShapedBody
+from capture4d.captures.animations.frame_files import AnimatedFrame
 from capture4d.captures.capture import read_capture
 from capture4d.captures.evaluation import correspondence_errors
 from capture4d.geometry.intersection_removal import Removed
 from capture4d.types import BlendshapeModel, PoseSequence, RegisteredSequence
 from data_synth.config import TrainingSetConfig
-from retarget.animation.animator import AnimatedFrame, Animator
+from retarget.animation.animator import Animator
 from retarget.animation.bodies import retargeted_mean
 from retarget.config import AnimateConfig, RemovalConfig, ShapeConfig
 from retarget.regression.learning import learn_shapes, learned_rows

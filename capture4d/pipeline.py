@@ -24,14 +24,25 @@ from capture4d.runs.decisions import forget_decisions, take_over_decisions
 from capture4d.runs.processes.pool import kept_workers
 from capture4d.runs.run_log import logged_stage
 from capture4d.runs.stage import StageResult
-from capture4d.synthetic import fit_styles, offsets_predict, offsets_train, scan, synth, synth_board, synth_drapes
+from capture4d.synthetic import (
+    fit_styles,
+    offsets_apply,
+    offsets_draw,
+    offsets_edit,
+    offsets_predict,
+    offsets_train,
+    scan,
+    synth,
+    synth_board,
+    synth_drapes,
+    wrinkles_offsets,
+)  # fmt: skip
 from capture4d.templates.config import TemplateConfig
 from capture4d.tracking.config import TrackingConfig
 from registration.config import MeshRegistrationConfig, RegistrationConfig
 from retarget.config import AnimateConfig, FitConfig
 from wrinkles.normal_maps import config as wrinkle_config
 from wrinkles.normal_maps.config import ApplyConfig, PairConfig, WrinkleConfig
-from wrinkles.offset_images.config import OffsetConfig
 
 if TYPE_CHECKING:
     from capture4d.calibration.check import CameraCheck
@@ -44,9 +55,9 @@ if TYPE_CHECKING:
 
 __all__ = [
     "animate", "calibrate", "check", "check_rig", "compare", "diff", "export", "extract", "fit", "fit_styles",
-    "import_meshes", "offsets_predict", "offsets_train", "register", "register_mesh", "report", "run", "scan", "score",
-    "status", "synth", "synth_board", "synth_drapes", "template", "track",
-    "wrinkles_apply", "wrinkles_maps", "wrinkles_offsets", "wrinkles_train",
+    "import_meshes", "offsets_apply", "offsets_draw", "offsets_edit", "offsets_predict", "offsets_train", "register",
+    "register_mesh", "report", "run", "scan", "score", "status", "synth", "synth_board", "synth_drapes", "template",
+    "track", "wrinkles_apply", "wrinkles_maps", "wrinkles_offsets", "wrinkles_train",
 ]  # fmt: skip
 
 
@@ -409,18 +420,6 @@ def wrinkles_apply(
     from wrinkles.normal_maps.apply_stage import run as stage
 
     return stage(Path(model), opened_work(work), config or ApplyConfig(), workers=workers, overwrite=overwrite)
-
-
-@logged_stage("wrinkles offsets")
-def wrinkles_offsets(
-    work: AnyWork, config: OffsetConfig | None = None, *, workers: int = 1, overwrite: bool = False
-) -> StageResult:
-    """Learn offset images of a registered take from its poses, and a baseline: WORK/wrinkles/offsets."""
-    from wrinkles.offset_images.model_files import OFFSETS
-    from wrinkles.offset_images.stage import run as stage
-
-    opened = opened_work(work)
-    return stage(opened, opened.path / OFFSETS, config or OffsetConfig(), workers=workers, overwrite=overwrite)
 
 
 @logged_stage("compare")

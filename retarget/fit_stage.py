@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from capture4d.body.binding import with_body_shape
+from capture4d.captures.animations.known_poses import PoseRange
 from capture4d.captures.work_folder import WorkFolder
 from capture4d.errors import InputError
 from capture4d.files.atomic import read_json, write_json
@@ -36,7 +37,7 @@ from retarget.model_folder import KERNEL, LINEAR, LSTM, MODEL, POSES, piece_name
 from retarget.regression.controls import ControlLayout
 from retarget.regression.ensemble import regressors_by_name
 from retarget.regression.kernel import fit_kernel, load_kernel, save_kernel
-from retarget.regression.known_range import CoefficientRange, ControlRange, KnownRange, PoseRange, save_known_range
+from retarget.regression.known_range import CoefficientRange, ControlRange, KnownRange, save_known_range
 from retarget.regression.learning import (
     Projected,
     UnposedTakes,

@@ -6,7 +6,6 @@ References: DeepWrinkles (ECCV 2018), sections 3.3 and 3.5.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -14,27 +13,14 @@ from jaxtyping import Float32, Float64
 from capture4d.body.binding import with_body_shape
 from capture4d.body.limbs import WornBody
 from capture4d.body.skinning import ShapedBody, pose_frame
-from capture4d.geometry.intersection_removal import IntersectionRemoval, Removed
+from capture4d.captures.animations.frame_files import AnimatedFrame
+from capture4d.geometry.intersection_removal import IntersectionRemoval
 from capture4d.geometry.mesh import edge_lengths, edge_stretch, stretch_p99, unique_edges
 from capture4d.types import BlendshapeModel, PoseSequence
 from retarget.config import AnimateConfig
 from retarget.shapes.blendshapes import reconstruct, skin_frames
 
-__all__ = ["FRAMES_AT_ONCE", "AnimatedFrame", "Animator"]
-
-FRAMES_AT_ONCE = 16
-"""More take more memory; another number, too, changes the last bits of matrix products."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class AnimatedFrame:
-    """The garment in one frame."""
-
-    vertices: Float32[np.ndarray, "verts 3"]
-    """Metres, world."""
-    removed: Removed
-    stretch_p99: float
-    """Edge length over the template's on this person, 99th percentile."""
+__all__ = ["Animator"]
 
 
 class Animator:

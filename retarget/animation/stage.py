@@ -18,6 +18,14 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from capture4d.body.skinning import ShapedBody
+from capture4d.captures.animations.frame_files import (
+    FRAMES_AT_ONCE,
+    FrameFiles,
+    collect,
+    motion_files,
+    open_frames,
+    write_frame,
+)
 from capture4d.errors import InputError
 from capture4d.files.arrays import map_array
 from capture4d.files.atomic import file_digest, write_npy
@@ -27,9 +35,8 @@ from capture4d.motions.motion_files import rate_note, read_motion, resample, sam
 from capture4d.runs.stage import Stage, StageResult
 from capture4d.runs.workers import run_jobs
 from capture4d.types import PoseSequence
-from retarget.animation.animator import FRAMES_AT_ONCE, Animator
+from retarget.animation.animator import Animator
 from retarget.animation.bodies import captured_person, person_of_shape, require_motion, retargeted_mean
-from retarget.animation.frame_files import FrameFiles, collect, motion_files, open_frames, write_frame
 from retarget.animation.frame_rates import coefficients_at, seconds
 from retarget.animation.garment_model import GarmentModel, load_garment_model
 from retarget.config import AnimateConfig

@@ -13,6 +13,15 @@ from pathlib import Path
 
 import numpy as np
 
+from capture4d.captures.animations.frame_files import (
+    FRAMES_AT_ONCE,
+    AnimatedFrame,
+    FrameFiles,
+    collect,
+    motion_files,
+    open_frames,
+    write_frame,
+)
 from capture4d.errors import InputError
 from capture4d.files.atomic import file_digest
 from capture4d.files.records import save_body, save_garment, save_poses
@@ -21,8 +30,6 @@ from capture4d.motions.motion_files import rate_note, read_motion, resample, sam
 from capture4d.runs.stage import StageResult
 from capture4d.runs.workers import run_jobs
 from capture4d.types import PoseSequence
-from retarget.animation.animator import FRAMES_AT_ONCE, AnimatedFrame
-from retarget.animation.frame_files import FrameFiles, collect, motion_files, open_frames, write_frame
 from retarget.config import AnimateConfig
 from retarget.mixture.model_files import MODEL_FILES, load_styled_garment
 from retarget.mixture.styled_garment import StyledGarment, WornGarment

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Float64
 
+from capture4d.captures.animations.known_poses import PoseRange, nearest_poses, pose_quaternions
 from capture4d.errors import InputError
 from retarget.mixture.config import NetworkConfig, StylesConfig
 from retarget.mixture.diffusion import Diffusion
@@ -30,7 +31,6 @@ from retarget.mixture.prototype_weights import (
 )
 from retarget.mixture.styled_garment import Canonical, StyledGarment
 from retarget.mixture.training import Examples, Trained, Trainer, said_by
-from retarget.regression.known_range import PoseRange, nearest_poses, pose_quaternions
 
 __all__ = ["Learned", "learn_styles"]
 

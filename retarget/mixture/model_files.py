@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from capture4d.captures.animations.known_poses import PoseRange
 from capture4d.captures.drapes.style_sets import Ranges
 from capture4d.errors import InputError
 from capture4d.files.json_values import entry, number, text, whole, wholes
@@ -29,7 +30,6 @@ from retarget.mixture.kernel_ridge import KernelRidge
 from retarget.mixture.predictors import Ensemble, Mixture, Predictor
 from retarget.mixture.styled_garment import Canonical, StyledGarment
 from retarget.mixture.training import made_network
-from retarget.regression.known_range import PoseRange
 
 __all__ = ["MODEL_FILES", "load_styled_garment", "save_styled_garment"]
 

@@ -17,6 +17,7 @@ from torch import nn
 
 from capture4d.body.limbs import WornBody
 from capture4d.body.skinning import PosedBody, ShapedBody, skin, with_pose, with_shape
+from capture4d.captures.animations.known_poses import PoseRange
 from capture4d.captures.drapes.style_sets import Ranges
 from capture4d.errors import InputError
 from capture4d.geometry.intersection_removal import IntersectionRemoval, Removed
@@ -28,7 +29,6 @@ from retarget.mixture.kernel_ridge import KernelRidge
 from retarget.mixture.lesson import person_under
 from retarget.mixture.predictors import Predictor
 from retarget.mixture.training import said_by
-from retarget.regression.known_range import PoseRange
 
 __all__ = ["Canonical", "StyledGarment", "WornGarment"]
 

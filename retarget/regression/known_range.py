@@ -18,14 +18,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64, Int64
-from scipy.spatial.transform import Rotation
+from jaxtyping import Float, Float32, Float64
 
+from capture4d.captures.animations.known_poses import PoseRange
 from capture4d.errors import InputError
 from capture4d.files.json_values import number, texts, wholes
 from capture4d.files.reading import reading, shortened
 from capture4d.files.tensors import TensorFile, read_tensors, write_tensors
-from capture4d.types import PoseSequence
 from retarget.regression.controls import ControlLayout
 from retarget.regression.regressors import Clip, Regressor, Trust, good_frames
 
@@ -34,10 +33,7 @@ __all__ = [
     "CoefficientRange",
     "ControlRange",
     "KnownRange",
-    "PoseRange",
     "load_known_range",
-    "nearest_poses",
-    "pose_quaternions",
     "save_known_range",
 ]
 
@@ -60,47 +56,6 @@ NUMBERS_OF_A_RADIAN = np.sqrt(4 / 3)
 """Length, on average over axes, of the change of two columns of a rotation matrix, for each radian of a small turn."""
 LEAST_MOTION = {"velocity": 0.1, "acceleration": 1.0, "turning": 0.5}
 """Motion that is always taken for known: m/s, m/s^2, rad/s; a hand's breadth at arm's length."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PoseRange:
-    """The poses a garment was learned from."""
-
-    quaternions: Float32[np.ndarray, "training joints 4"]
-    joints: tuple[int, ...]
-    """The garment's, as positions in the skeleton."""
-    validated_deg: float
-    """How far validation frames were from the training poses while they validated, 95 %."""
-
-    def distances(self, poses: PoseSequence) -> Float64[np.ndarray, " frames"]:
-        """Degrees to the nearest learned pose."""
-        return nearest_poses(pose_quaternions(poses.rotations, self.joints), self.quaternions)[0]
-
-
-def pose_quaternions(
-    rotations: Float[np.ndarray, "frames all 3 3"], joints: tuple[int, ...]
-) -> Float32[np.ndarray, "frames joints 4"]:
-    """Rotations of some joints as unit quaternions."""
-    chosen = rotations[:, list(joints)].astype(np.float64)
-    return Rotation.from_matrix(chosen.reshape(-1, 3, 3)).as_quat().reshape(*chosen.shape[:2], 4).astype(np.float32)
-
-
-def nearest_poses(
-    poses: Float32[np.ndarray, "frames joints 4"], training: Float32[np.ndarray, "training joints 4"]
-) -> tuple[Float64[np.ndarray, " frames"], Int64[np.ndarray, " frames"]]:
-    """Distance in degrees to the nearest training pose, and which it is."""
-    distance, nearest = np.zeros(len(poses)), np.zeros(len(poses), np.int64)
-    joints = poses.shape[1]
-    if not joints or not len(training):
-        return distance, nearest
-    size = max(1, PAIRS // (len(training) * joints))
-    for start in range(0, len(poses), size):
-        part = poses[start : start + size].astype(np.float64)
-        cosine = np.abs(np.einsum("tjq,njq->tnj", part, training.astype(np.float64)))
-        squares = np.mean((2 * np.arccos(np.minimum(cosine, 1.0))) ** 2, axis=2)
-        nearest[start : start + size] = np.argmin(squares, axis=1)
-        distance[start : start + size] = np.degrees(np.sqrt(squares.min(axis=1)))
-    return distance, nearest
 
 
 # --- controls ----------------------------------------------------------------------------------------------------

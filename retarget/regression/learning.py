@@ -11,16 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int64
 
+from capture4d.captures.animations.known_poses import PoseRange, nearest_poses, pose_quaternions
 from capture4d.types import PoseSequence
 from retarget.config import ShapeConfig
 from retarget.regression.controls import ControlLayout, control_vectors
-from retarget.regression.known_range import (
-    CoefficientRange,
-    ControlRange,
-    PoseRange,
-    nearest_poses,
-    pose_quaternions,
-)
+from retarget.regression.known_range import CoefficientRange, ControlRange
 from retarget.regression.regressors import Clip, FittingClips, Regressor, Trust
 from retarget.regression.splits import Piece, Role
 from retarget.shapes.blendshapes import (

@@ -16,11 +16,21 @@ from capture4d.settings import (
     Range,
     Seed,
     SettingError,
+    Share,
     Whole,
     settings,
 )
 
-__all__ = ["PRESETS", "DrapeOffsetsConfig", "OffsetConfig", "OffsetTrainingConfig", "PatchConfig", "StripConfig"]
+__all__ = [
+    "PRESETS",
+    "DrapeOffsetsConfig",
+    "OffsetConfig",
+    "OffsetTrainingConfig",
+    "PatchConfig",
+    "PredictOffsetsConfig",
+    "RemovalConfig",
+    "StripConfig",
+]
 
 Texels = Annotated[int, Range(least=16, most=1024), PowerOfTwo]
 Eights = Condition(lambda number: number % 8 == 0, "a multiple of 8")
@@ -128,6 +138,35 @@ class DrapeOffsetsConfig:
     def __post_init__(self) -> None:
         if self.residual and self.partner:
             raise SettingError(self, "partner", "one of residual and partner", True)
+
+
+@settings
+class RemovalConfig:
+    """Taking the garment out of the body; `IntersectionRemoval` reads this."""
+
+    enabled: bool = True
+    """Take it out; off, what is inside is only measured."""
+    margin_mm: NonNegative = 2.0
+    """How far outside the body its vertices are put."""
+    rounds: Whole = 12
+    """Searches for where the limbs are; it ends sooner if nothing moves."""
+    sweeps: Count = 15
+    """Passes over all edges and vertices from one search to the next."""
+    spread: Share = 0.2
+    """Share of the way to its neighbours' mean displacement that a vertex goes in a pass, at first; none in the end."""
+
+
+@settings
+class PredictOffsetsConfig:
+    """Putting a garment that drapes have taught on a motion."""
+
+    longest: NonNegative = 1.15
+    """Edges are drawn together to this many times their length on the pattern; 0: they stay as long as they come."""
+    unlike_deg: NonNegative = 10.0
+    """A pose farther than this from every learned pose is reported, unless drapes that chose the epoch were farther."""
+    fps: Positive | None = None
+    """Frame rate of what is written; the motion's own if absent."""
+    removal: RemovalConfig = field(default_factory=RemovalConfig)
 
 
 _SMALL = DrapeOffsetsConfig()

@@ -15,7 +15,7 @@ from capture4d.types import PoseSequence
 from wrinkles.offset_images.frames import OffsetFrames, joined_frames, offset_frames
 from wrinkles.offset_images.layout import OffsetLayout, OffsetSpace
 
-__all__ = ["DrapeLesson", "drape_frames", "drape_lesson", "read_parted_drapes"]
+__all__ = ["DrapeLesson", "drape_frames", "drape_lesson", "read_parted_drapes", "still_poses"]
 
 STILL_FPS = 60.0
 """Drapes have no rate; their poses are told as if they were frames of a take."""
@@ -77,8 +77,13 @@ def drape_frames(
     space: OffsetSpace,
 ) -> OffsetFrames:
     """Encode some drapes of a set."""
-    poses = PoseSequence(
+    poses = still_poses(drapes, rows)
+    return offset_frames(layout, drapes.body, poses, drapes.vertices[rows], joints, space=space)
+
+
+def still_poses(drapes: DrapeSet, rows: Int[np.ndarray, " rows"]) -> PoseSequence:
+    """The poses of some drapes of a set."""
+    return PoseSequence(
         drapes.rotations[rows], np.zeros((len(rows), 3), np.float32), drapes.shape, drapes.numbers[rows], STILL_FPS,
         drapes.body.joint_names,
     )  # fmt: skip
-    return offset_frames(layout, drapes.body, poses, drapes.vertices[rows], joints, space=space)

@@ -20,6 +20,7 @@ from jaxtyping import Float, Float32, Float64, Int32
 from torch import Tensor, nn
 
 from capture4d.body.skinning import pose_frame, with_shape
+from capture4d.captures.animations.known_poses import PoseRange
 from capture4d.errors import InputError
 from capture4d.files.json_values import entry, number, text, texts, whole
 from capture4d.files.reading import reading
@@ -33,7 +34,7 @@ from wrinkles.offset_images.canvas import OffsetSampler, Window
 from wrinkles.offset_images.config import DrapeOffsetsConfig, PatchConfig, StripConfig
 from wrinkles.offset_images.frames import CM
 from wrinkles.offset_images.kernels import PoseKernels
-from wrinkles.offset_images.layout import OffsetLayout, decode
+from wrinkles.offset_images.layout import OffsetLayout, decode, worn_part
 from wrinkles.offset_images.networks import (
     FullyConnected,
     PcaFullyConnected,
@@ -110,6 +111,8 @@ class ModelParts:
     """Of the patches."""
     kernels: PoseKernels | None
     filter: OffsetFilter | None
+    learned: PoseRange
+    """The poses of the drapes, mirrored ones among them if they were learned."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -165,14 +168,15 @@ class DrapeOffsets:
         if poses.joint_names != body.joint_names:
             raise InputError("poses: expected the joints of the body that the garment was draped on, found others")
         joints = [body.joint_names.index(name) for name in self.parts.joint_names]
-        person = with_shape(body, self.parts.shape)
+        near, skin = worn_part(self.layout, body)
+        person = with_shape(skin, self.parts.shape)
         found = np.empty((len(poses.frame_ids), len(self.layout.garment.template.vertices), 3))
         for start in range(0, len(found), 64):
             rows = range(start, min(start + 64, len(found)))
             pose = torch.from_numpy(np.ascontiguousarray(poses.rotations[rows][:, joints]).reshape(len(rows), -1))
             offsets = self.offsets(pose).double().numpy() / CM
             for row, own in zip(rows, offsets, strict=True):
-                anchors = self.layout.anchors(pose_frame(person, poses, row), self.parts.config.space)
+                anchors = near.anchors(pose_frame(person, poses, row), self.parts.config.space)
                 found[row] = self.layout.vertices(decode(anchors, own))
         return found
 
@@ -212,7 +216,8 @@ def save_model_parts(folder: Path, parts: ModelParts) -> list[Path]:
     names = ("network", "space", "texels", "shuffled", "residual", "partner")
     note: dict[str, Any] = {name: getattr(config, name) for name in names}
     note |= {"patch": asdict(config.patch), "strip": asdict(config.strip), "joints": list(parts.joint_names)}
-    tensors: dict[str, np.ndarray] = {"shape": parts.shape}
+    note["validated_deg"] = parts.learned.validated_deg
+    tensors: dict[str, np.ndarray] = {"shape": parts.shape, "learned": parts.learned.quaternions}
     if parts.labels is not None:
         tensors["labels"] = parts.labels
     if (kernels := parts.kernels) is not None:
@@ -273,7 +278,13 @@ def _parts(file: TensorFile, garment: Garment, body: Body) -> ModelParts:
         kernels = PoseKernels(**arrays, width=width, line=line)
     if "filter.mean" in file.tensors:
         kept = OffsetFilter(file["filter.mean"], file["filter.basis"])
-    return ModelParts(config, garment, body, shape, joints, labels, kernels, kept)
+    learned, validated = file["learned"], number(file.entry("validated_deg"), "validated_deg")
+    require_array("model", "learned", learned, (None, len(joints), 4), np.float32)
+    require_finite("model", "learned", learned)
+    if validated < 0:
+        raise InputError(f"validated_deg: expected no less than 0, found {validated:g}")
+    known = PoseRange(learned, tuple(body.joint_names.index(name) for name in joints), validated)
+    return ModelParts(config, garment, body, shape, joints, labels, kernels, kept, known)
 
 
 def _require_fit(parts: ModelParts, layout: OffsetLayout) -> None:

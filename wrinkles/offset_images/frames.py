@@ -15,7 +15,7 @@ from torch import Tensor
 
 from capture4d.body.skinning import pose_frame, with_shape
 from capture4d.types import Body, PoseSequence
-from wrinkles.offset_images.layout import OffsetLayout, OffsetSpace, encode
+from wrinkles.offset_images.layout import OffsetLayout, OffsetSpace, encode, worn_part
 
 __all__ = ["CM", "OffsetFrames", "joined_frames", "offset_frames", "pose_joints", "vertex_errors_cm"]
 
@@ -80,10 +80,11 @@ def offset_frames(
     space: OffsetSpace = "local",
 ) -> OffsetFrames:
     """Encode frames of cloth, whose poses are those of `poses`, row by row."""
-    shaped = with_shape(body, poses.shape)
+    near, skin = worn_part(layout, body)
+    shaped = with_shape(skin, poses.shape)
     offsets, points, axes = [], [], []
     for row, placed in enumerate(vertices):
-        anchors = layout.anchors(pose_frame(shaped, poses, row), space)
+        anchors = near.anchors(pose_frame(shaped, poses, row), space)
         offsets.append(CM * encode(anchors, placed[layout.vertex].astype(np.float64)))
         points.append(CM * anchors.points)
         axes.append(anchors.axes)

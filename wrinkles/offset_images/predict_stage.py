@@ -1,59 +1,143 @@
-"""The stage that puts a garment learned from drapes on a motion: MODEL and poses in, OUTPUT out.
+"""The stage that puts a garment learned from drapes on a motion: MODEL and poses in, an animated garment out.
 
-stage.json
-garment.npz body.npz poses.npz   what moves, and how
-vertices.npy                     (frames, vertices, 3), metres
-
-Nothing is known of time: every frame is the drape of its pose.
+WORK/body and WORK/registration are those of any animation (`capture4d.captures.animations.frame_files`): out of the
+body, and graded. Nothing is known of time: every frame is the drape of its pose, so that a motion keeps its own rate.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float64, Int32
 
-from capture4d.files.atomic import file_digest, write_npy
+from capture4d.body.limbs import WornBody
+from capture4d.body.skinning import ShapedBody, pose_frame, with_shape
+from capture4d.captures.animations.frame_files import (
+    FRAMES_AT_ONCE,
+    AnimatedFrame,
+    FrameFiles,
+    collect,
+    motion_files,
+    open_frames,
+    write_frame,
+)
+from capture4d.errors import InputError
+from capture4d.files.atomic import file_digest
 from capture4d.files.outputs import require_apart
 from capture4d.files.records import save_body, save_garment, save_poses
-from capture4d.motions.motion_files import read_motion, told
-from capture4d.runs.stage import StageResult, complete_record, open_stage
-from wrinkles.offset_images.drape_model import load_drape_offsets
+from capture4d.geometry.intersection_removal import IntersectionRemoval
+from capture4d.geometry.mesh import edge_stretch, flat_edge_lengths, stretch_p99, unique_edges
+from capture4d.geometry.uv_layout import require_uvs
+from capture4d.motions.motion_files import rate_note, read_motion, resample, same_rate, told
+from capture4d.runs.stage import StageResult, complete_record
+from capture4d.runs.workers import run_jobs
+from capture4d.types import PoseSequence
+from wrinkles.offset_images.config import PredictOffsetsConfig
+from wrinkles.offset_images.drape_model import DrapeOffsets, load_drape_offsets
 from wrinkles.offset_images.train_stage import STAGE as TRAINED
 
 __all__ = ["run"]
 
-STAGE, SCHEMA = "offsets predict", 1
-FILES = ("garment.npz", "body.npz", "poses.npz", "vertices.npy")
 
-
-def run(model: Path, poses: Path, output: Path, *, workers: int = 1, overwrite: bool = False) -> StageResult:
-    """Predict a garment in every frame of a motion, on the person it was draped on.
+def run(
+    model: Path,
+    poses: Path,
+    output: Path,
+    config: PredictOffsetsConfig,
+    *,
+    workers: int = 1,
+    overwrite: bool = False,
+) -> StageResult:
+    """Put a garment on a motion of the person it was draped on; `failed` are the frames whose cloth is torn.
 
     Args:
         model: what `offsets train` wrote.
         poses: a motion file.
+        output: work folder; gets body/ and registration/.
     Raises:
-        InputError: a file is missing or damaged, or the motion does not fit the body.
+        InputError: a file is missing or damaged, or would be written over, or the motion does not fit the body.
     """
-    require_apart([output / name for name in FILES], [poses])
+    require_apart(motion_files(output), [poses])
+    if (output / "body" / "stage.json").is_file():
+        raise InputError("expected a folder for the animation alone, found a take with a tracked body", where=output)
     record = complete_record(model, TRAINED, f"capture4d offsets train DRAPES --output {model}")
     known = load_drape_offsets(model)
-    motion = read_motion(poses, known.parts.body, say=told(poses))
-    motion = replace(motion, shape=known.parts.shape)
+    garment, body, shape = known.parts.garment, known.parts.body, known.parts.shape
+    motion = _motion(poses, known, config.fps)
     upstream = {"model": record["digest"], "poses": file_digest([poses], root=poses.parent)}
-    stage = open_stage(
-        output, name=STAGE, schema=SCHEMA, config={}, upstream=upstream, sources={"model": model, "poses": poses},
-        overwrite=overwrite,
-    )  # fmt: skip
-    paths, count = [output / name for name in FILES], len(motion.frame_ids)
-    if stage.was_complete and all(path.is_file() for path in paths):
-        return stage.finish(paths, changed=False, frames=count)
-    torch.set_num_threads(workers)
-    write_npy(output / "vertices.npy", known.vertices(motion).astype(np.float32))
-    save_garment(output / "garment.npz", known.parts.garment)
-    save_body(output / "body.npz", known.parts.body)
-    save_poses(output / "poses.npz", motion)
-    return stage.finish(paths, frames=count)
+    stage = open_frames(output, asdict(config), upstream, {"model": model, "poses": poses}, overwrite=overwrite)
+    for path, write, value in zip(motion_files(output), (save_body, save_poses), (body, motion), strict=True):
+        write(path, value)
+    save_garment(stage.path / "garment.npz", replace(garment, body_shape=np.asarray(shape, np.float32)))
+    frame_ids = [int(frame_id) for frame_id in motion.frame_ids]
+    pending = set(stage.pending(frame_ids))
+    rows = [row for row, frame_id in enumerate(frame_ids) if frame_id in pending]
+    chunks = [tuple(rows[start : start + FRAMES_AT_ONCE]) for start in range(0, len(rows), FRAMES_AT_ONCE)]
+    learned = known.parts.learned
+    shared = FrameFiles(stage, motion, learned.distances(motion), max(config.unlike_deg, learned.validated_deg))
+    prepare = partial(_Dressed.read, model, config)
+    for _ in run_jobs(
+        partial(_write_frames, shared), chunks, prepare=prepare, workers=workers, label="predict", units=len
+    ):
+        pass
+    return collect(stage, frame_ids)
+
+
+def _motion(path: Path, known: DrapeOffsets, fps: float | None) -> PoseSequence:
+    """The motion on the person, at its own rate or at the wanted one."""
+    say = told(path)
+    found = read_motion(path, known.parts.body, say=say)
+    if found.joint_names != known.parts.body.joint_names or not len(found.frame_ids):
+        raise InputError(f"expected frames of the {len(known.parts.body.joint_names)} joints of the model, found "
+                         f"{len(found.frame_ids)} of {len(found.joint_names)}", where=path)  # fmt: skip
+    found = replace(found, shape=np.asarray(known.parts.shape, np.float32))
+    if fps is None or same_rate(fps, found.fps):
+        return found
+    try:
+        shown = resample(found, fps)
+    except InputError as error:
+        raise error.at(path) from None
+    say(rate_note(found.fps, len(found.frame_ids), shown.fps, len(shown.frame_ids), whose=""))
+    return shown
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Dressed:
+    """The garment on its person, with what frames share."""
+
+    model: DrapeOffsets
+    person: ShapedBody
+    edges: Int32[np.ndarray, "E 2"]
+    lengths: Float64[np.ndarray, " E"]
+    """On the pattern, metres: the garment as it was put on is crushed under the arms where they have been lowered."""
+    removal: IntersectionRemoval
+    worn: WornBody
+
+    @staticmethod
+    def read(model: Path, config: PredictOffsetsConfig) -> _Dressed:
+        """For a process; on one thread, so that any number of processes gives the same vertices."""
+        torch.set_num_threads(1)
+        known = load_drape_offsets(model)
+        garment, person = known.parts.garment, with_shape(known.parts.body, known.parts.shape)
+        at_rest = garment.template.vertices.astype(np.float64)
+        edges = unique_edges(garment.template.faces)
+        # the pattern, in metres, is what UVs of drapes are
+        lengths = flat_edge_lengths(require_uvs(garment.template), garment.template.faces, edges)
+        longest = config.longest or float("inf")
+        removal = IntersectionRemoval(garment.template.faces, len(at_rest), lengths, longest, config.removal)
+        assert garment.skin_weights is not None
+        return _Dressed(known, person, edges, lengths, removal, WornBody(person, at_rest, garment.skin_weights))
+
+
+def _write_frames(shared: FrameFiles, dressed: _Dressed, rows: Sequence[int]) -> None:
+    placed = dressed.model.vertices(shared.poses.of_frames(shared.poses.frame_ids[list(rows)]))
+    for row, vertices in zip(rows, placed, strict=True):
+        body = pose_frame(dressed.person, shared.poses, row)
+        removed = dressed.removal(vertices, dressed.worn.posed(body.vertices()))
+        stretch = stretch_p99(edge_stretch(removed.vertices, dressed.edges, dressed.lengths))
+        write_frame(shared, row, AnimatedFrame(removed.vertices.astype(np.float32), removed, stretch))

@@ -18,9 +18,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int32
+from jaxtyping import Float, Float32, Int32
 from torch import Tensor, nn
 
+from capture4d.captures.animations.known_poses import PoseRange, nearest_poses, pose_quaternions
 from capture4d.captures.drapes.drape_parts import DrapeParts
 from capture4d.captures.drapes.drape_sets import DrapeSet
 from capture4d.errors import InputError
@@ -53,7 +54,7 @@ from wrinkles.offset_images.training import OffsetLesson, start_training
 
 __all__ = ["ERRORS", "run"]
 
-STAGE, SCHEMA = "offsets train", 1
+STAGE, SCHEMA = "offsets train", 2
 ERRORS = "errors.json"
 COMMAND = "capture4d offsets train DRAPES --output MODEL"
 DRAPES = "synth-drapes"
@@ -136,11 +137,25 @@ def _learn_parts(
     names = tuple(drapes.body.joint_names[joint] for joint in parts.joints)
     save_model_parts(
         stage.path,
-        ModelParts(config, drapes.garment, drapes.body, drapes.shape, names, labels, kernels, kept),
+        ModelParts(
+            config, drapes.garment, drapes.body, drapes.shape, names, labels, kernels, kept, _known_poses(parts, lesson)
+        ),
     )
     if not config.residual or kernels is None or guessed is None:
         return None
     return guessed, kernels.offsets(lesson.validation.pose)
+
+
+def _known_poses(parts: DrapeParts, lesson: DrapeLesson) -> PoseRange:
+    """The poses that are learned, and how far those that choose the epoch are from them."""
+
+    def quaternions(pose: Tensor) -> Float32[np.ndarray, "frames joints 4"]:
+        rotations = pose.numpy().reshape(len(pose), -1, 3, 3)
+        return pose_quaternions(rotations, tuple(range(rotations.shape[1])))
+
+    learned = quaternions(lesson.train.pose)
+    distances, _ = nearest_poses(quaternions(lesson.validation.pose), learned)
+    return PoseRange(learned, tuple(parts.joints.tolist()), float(np.percentile(distances, 95)))
 
 
 def _learn_networks(
@@ -204,6 +219,7 @@ def _errors(model: DrapeOffsets, lesson: DrapeLesson, drapes: int) -> dict[str, 
                 "normal": float(normal_loss(made, frames.vertices, sampler.faces)),
                 "edge_cm": float(edge_length_loss(made, frames.vertices, sampler.edges)),
                 "mean_vertex_cm": vertex_errors_cm(usual, frames.vertices),
+                "largest_offset_cm": float(frames.offsets.norm(dim=-1).max()),
             }
         )
     if model.parts.labels is not None:

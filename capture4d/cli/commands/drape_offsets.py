@@ -9,10 +9,11 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from capture4d.cli.exit_codes import GOOD
-from capture4d.cli.options import StageOptions, all_cores
+from capture4d.cli.options import GradedOptions, StageOptions, all_cores
+from capture4d.cli.verdict import say_verdict
 from capture4d.settings import Count
 from wrinkles.offset_images import config as offset_config
-from wrinkles.offset_images.config import DrapeOffsetsConfig
+from wrinkles.offset_images.config import DrapeOffsetsConfig, PredictOffsetsConfig
 
 __all__ = ["OffsetsPredict", "OffsetsTrain"]
 
@@ -53,23 +54,23 @@ class OffsetsTrain(StageOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OffsetsPredict(StageOptions):
-    """Put a garment that `offsets train` learned on a motion of the person it was draped on."""
+class OffsetsPredict(GradedOptions):
+    """Put a garment that `offsets train` learned on a motion of the person it was draped on, taken out of the body."""
 
     model: Annotated[Positional[Path], arg(metavar="MODEL")]
     """What `offsets train` wrote."""
     poses: Path
     """Motion to follow, one of those that `convert-poses` reads."""
     output: Path
-    """Folder to write; gets vertices.npy, and the garment, body and poses it belongs to."""
-    workers: Count = field(default_factory=all_cores)
-    """Threads; equal numbers give equal vertices."""
+    """Work folder; gets body/ and registration/, as `animate` writes them."""
+    config: Annotated[PredictOffsetsConfig, arg(name="")] = field(default_factory=PredictOffsetsConfig)
 
     def __call__(self) -> int:
         from capture4d import pipeline
 
         result = pipeline.offsets_predict(
-            self.model, self.poses, self.output, workers=self.workers, overwrite=self.overwrite
+            self.model, self.poses, self.output, self.config, workers=self.workers, overwrite=self.overwrite
         )
-        print(f"garment in {result.frames} frames: {result.path / 'vertices.npy'}")
-        return GOOD
+        say_verdict(result.path, "predict")
+        print(f"registration: {result.path}")
+        return self.graded(result)

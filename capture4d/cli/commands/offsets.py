@@ -12,7 +12,8 @@ from capture4d.cli.commands.files import FileOptions
 from capture4d.cli.exit_codes import GOOD
 from capture4d.cli.options import MeshOptions
 from capture4d.settings import Whole
-from wrinkles.offset_images.editing.config import ApplyEditsConfig, DrawConfig
+from wrinkles.offset_images.config import RemovalConfig
+from wrinkles.offset_images.editing.config import DrawConfig
 
 __all__ = ["OffsetsApply", "OffsetsDraw", "OffsetsEdit"]
 
@@ -30,12 +31,9 @@ class OffsetsDraw(FileOptions, MeshOptions):
     config: Annotated[DrawConfig, arg(name="")] = field(default_factory=DrawConfig)
 
     def __call__(self) -> int:
-        from capture4d.captures.work_folder import open_work
-        from capture4d.files.outputs import new_files_in
-        from wrinkles.offset_images.editing.stage import draw
+        from capture4d import pipeline
 
-        with new_files_in(self.output, overwrite=self.overwrite) as workshop:
-            draw(open_work(self.work), self.frame, workshop, self.config)
+        pipeline.offsets_draw(self.work, self.frame, self.output, self.config, overwrite=self.overwrite)
         print(f"pictures: {self.output}; centimetres along tangent (red), bitangent (green), normal (blue)")
         return GOOD
 
@@ -56,13 +54,9 @@ class OffsetsEdit(FileOptions, MeshOptions):
     """Folder to write."""
 
     def __call__(self) -> int:
-        from capture4d.captures.work_folder import open_work
-        from capture4d.files.outputs import new_files_in
-        from wrinkles.offset_images.editing.stage import edit
+        from capture4d import pipeline
 
-        inputs = [path for path in sorted(self.pictures.glob("*")) if path.is_file()]
-        with new_files_in(self.output, inputs=[self.operations, *inputs], overwrite=self.overwrite) as workshop:
-            edit(self.pictures, self.operations, open_work(self.work), workshop)
+        pipeline.offsets_edit(self.pictures, self.operations, self.work, self.output, overwrite=self.overwrite)
         print(f"pictures: {self.output}")
         return GOOD
 
@@ -77,18 +71,12 @@ class OffsetsApply(FileOptions, MeshOptions):
     """Work folder that they were drawn of."""
     output: Path
     """Mesh to write: ply, obj, glb or off."""
-    config: Annotated[ApplyEditsConfig, arg(name="removal")] = field(default_factory=ApplyEditsConfig)
+    config: Annotated[RemovalConfig, arg(name="removal")] = field(default_factory=RemovalConfig)
 
     def __call__(self) -> int:
-        from capture4d.captures.work_folder import open_work
-        from capture4d.files.outputs import new_files
-        from capture4d.mesh_files.meshes import write_mesh
-        from wrinkles.offset_images.editing.stage import apply
+        from capture4d import pipeline
 
-        inputs = [path for path in sorted(self.pictures.glob("*")) if path.is_file()]
-        with new_files([self.output], inputs=inputs, overwrite=self.overwrite) as workshop:
-            edited = apply(self.pictures, open_work(self.work), self.config)
-            write_mesh(workshop / self.output.name, edited.mesh)
+        edited = pipeline.offsets_apply(self.pictures, self.work, self.output, self.config, overwrite=self.overwrite)
         if edited.removed is None:
             print("nothing was changed")
         else:

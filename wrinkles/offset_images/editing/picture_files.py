@@ -67,12 +67,22 @@ def read_change(path: Path, written: np.ndarray) -> Float32[np.ndarray, "size si
                 raise InputError(f"expected 32 bits of float in a channel as it was drawn, found {found.dtype}")
             if not np.isfinite(found).all():
                 raise InputError("expected finite offsets, found others")
+            if _is_clipped(found, written):
+                raise InputError("expected centimetres of any sign, found nothing below 0 or above 1: the program that "
+                                 "wrote it has clipped them; draw with --format png for it")  # fmt: skip
             return (found.astype(np.float64) - written).astype(np.float32)
         if found.dtype not in FULL:
             raise InputError(f"expected 16 or 8 bits a channel, found {found.dtype}")
         full = FULL[found.dtype]
         before = written if found.dtype == written.dtype else np.round(written / 257.0)
         return (RANGE_CM / full * (found.astype(np.float64) - before)).astype(np.float32)
+
+
+def _is_clipped(found: np.ndarray, written: np.ndarray) -> bool:
+    """Whether a program that takes floats for shares of white has written a picture, such as ImageMagick with 16 bits
+    a quantum."""
+    within = float(found.min()) >= 0 and float(found.max()) <= 1
+    return within and (float(written.min()) < 0 or float(written.max()) > 1)
 
 
 def _with_text(data: bytes) -> bytes:

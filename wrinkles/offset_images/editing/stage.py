@@ -29,8 +29,9 @@ from capture4d.files.reading import reading
 from capture4d.geometry.intersection_removal import IntersectionRemoval, Removed
 from capture4d.geometry.mesh import edge_lengths, unique_edges
 from capture4d.types import Mesh
+from wrinkles.offset_images.config import RemovalConfig
 from wrinkles.offset_images.editing.changes import changed_vertices
-from wrinkles.offset_images.editing.config import ApplyEditsConfig, DrawConfig, PictureFormat
+from wrinkles.offset_images.editing.config import DrawConfig, PictureFormat
 from wrinkles.offset_images.editing.operations import apply_operation, read_operations
 from wrinkles.offset_images.editing.picture_files import RANGE_CM, read_change, write_picture
 from wrinkles.offset_images.layout import OffsetLayout, encode
@@ -127,7 +128,7 @@ def edit(drawn: Path, operations: Path, work: WorkFolder, output: Path) -> None:
     write_json(output / LAYOUT, found.notes | {"operations": done})
 
 
-def apply(drawn: Path, work: WorkFolder, config: ApplyEditsConfig) -> Edited:
+def apply(drawn: Path, work: WorkFolder, config: RemovalConfig) -> Edited:
     """The garment that the pictures of a folder show, out of the body.
 
     Raises:

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from capture4d.captures.animations.known_poses import PoseRange, pose_quaternions
 from capture4d.errors import InputError
 from capture4d.types import PoseSequence
 from retarget.config import ControlConfig
@@ -19,9 +20,7 @@ from retarget.regression.known_range import (
     CoefficientRange,
     ControlRange,
     KnownRange,
-    PoseRange,
     load_known_range,
-    pose_quaternions,
     save_known_range,
 )
 from retarget.regression.regressors import Clip, Trust

@@ -12,6 +12,7 @@ import torch
 from capture4d.body.binding import bind
 from capture4d.captures.drapes.drape_parts import mirrored_drapes, read_drape_parts
 from capture4d.captures.drapes.drape_sets import read_drapes
+from capture4d.captures.work_folder import open_work
 from capture4d.errors import InputError
 from capture4d.files.atomic import read_json, write_json, write_npz
 from capture4d.files.records import save_body, save_garment, save_poses
@@ -20,10 +21,18 @@ from capture4d.types import Body, Mesh, PoseSequence
 from tests.command_line import fails, run
 from tests.unit.wrinkles.conftest import some_garment
 from tests.unit.wrinkles.offset_images.test_layout import bent, limb, upright
-from wrinkles.offset_images import resumable, train_stage
-from wrinkles.offset_images.config import PRESETS, DrapeOffsetsConfig, OffsetTrainingConfig, PatchConfig, StripConfig
+from wrinkles.offset_images import predict_stage, resumable, train_stage
+from wrinkles.offset_images.config import (
+    PRESETS,
+    DrapeOffsetsConfig,
+    OffsetTrainingConfig,
+    PatchConfig,
+    PredictOffsetsConfig,
+    RemovalConfig,
+    StripConfig,
+)
 from wrinkles.offset_images.drape_lessons import drape_lesson
-from wrinkles.offset_images.drape_model import load_drape_offsets
+from wrinkles.offset_images.drape_model import load_drape_offsets, save_model_parts
 from wrinkles.offset_images.frames import vertex_errors_cm
 from wrinkles.offset_images.layout import OffsetLayout, decode
 
@@ -218,10 +227,52 @@ def test_the_commands_train_and_predict(drapes: Path, tmp_path: Path, capsys: py
     out = tmp_path / "dance"
     options = ("--poses", tmp_path / "motion.npz", "--output", out, "--workers", "1")
     assert run("offsets", "predict", tmp_path / "model", *options) == 0
-    made = np.load(out / "vertices.npy")
+    said = capsys.readouterr().out
+    assert "predict: " in said
+    assert "of 2 frames" in said
+    made = np.load(out / "registration" / "vertices.npy")
     assert made.shape == (2, len(read_drapes(drapes).garment.template.vertices), 3)
     assert np.abs(made[1] - made[0] - (1, 2, 3)).max() < 0.2  # the garment goes where the body goes
-    assert {path.name for path in out.iterdir()} >= {"garment.npz", "body.npz", "poses.npz", "vertices.npy"}
+    work = open_work(out)
+    assert work.is_animated
+    assert work.registered.frame_ids.tolist() == [4, 5]
+    assert max(each["pose_distance_deg"] for each in work.records) < 5
+    assert run("report", out, "--workers", "1") == 0
+    assert (out / "report" / "index.html").is_file()
+
+
+def test_a_predicted_garment_leaves_the_body(drapes: Path, tmp_path: Path):
+    """Kernels that know only deep dents: predicted inside, shown outside; a far pose is said to be far."""
+    model = train_stage.run(
+        drapes, tmp_path / "model", DrapeOffsetsConfig(network="kernels", texels=32, mirrored=False)
+    ).path
+    parts = load_drape_offsets(model).parts
+    assert parts.kernels is not None
+    deeper = np.tile(np.float32([0, 0, 7]), len(parts.kernels.mean) // 3)
+    sunk = replace(parts.kernels, mean=parts.kernels.mean - deeper)
+    record = (model / "stage.json").read_bytes()
+    save_model_parts(model, replace(parts, kernels=sunk))
+    (model / "stage.json").write_bytes(record)
+    body = parts.body
+    rotations = np.stack([bent(body, angle).rotations for angle in (0.1, 2.4)]).astype(np.float32)
+    poses = PoseSequence(
+        rotations, np.zeros((2, 3), np.float32), np.zeros(1, np.float32), np.array([1, 2], np.int32), 30.0,
+        body.joint_names,
+    )  # fmt: skip
+    save_poses(tmp_path / "motion.npz", poses)
+    found = {}
+    for on in (True, False):
+        config = PredictOffsetsConfig(removal=RemovalConfig(enabled=on))
+        predict_stage.run(model, tmp_path / "motion.npz", tmp_path / str(on), config)
+        found[on] = open_work(tmp_path / str(on)).records
+    assert found[True][0]["inside_before_percent"] > 30
+    assert found[True][0]["inside_body_percent"] < 1
+    assert found[False][0]["inside_body_percent"] == pytest.approx(found[True][0]["inside_before_percent"])
+    assert any("from every pose that was learned" in reason for reason in found[True][1]["reasons"])
+    assert not any("from every pose" in reason for reason in found[True][0]["reasons"])
+    shutil.copytree(tmp_path / "True", tmp_path / "again")
+    with pytest.raises(InputError, match="found the input"):
+        predict_stage.run(model, tmp_path / "again" / "body" / "poses.npz", tmp_path / "again", PredictOffsetsConfig())
 
 
 def test_what_cannot_be_learned_from_is_one_line(drapes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -14,7 +14,7 @@ from tests.unit.wrinkles.conftest import sleeve, wrinkled
 from wrinkles.offset_images.canvas import OffsetSampler
 from wrinkles.offset_images.config import OffsetTrainingConfig
 from wrinkles.offset_images.frames import offset_frames, pose_joints, vertex_errors_cm
-from wrinkles.offset_images.layout import Anchors, OffsetLayout, decode, encode
+from wrinkles.offset_images.layout import Anchors, OffsetLayout, decode, encode, worn_part
 from wrinkles.offset_images.losses import grid_loss, normal_loss
 from wrinkles.offset_images.networks import FullyConnected, PcaFullyConnected
 from wrinkles.offset_images.training import OffsetLesson, predict, train_offsets
@@ -73,6 +73,32 @@ def test_encoding_and_decoding_is_exact(bound: tuple[Garment, Body], space: str)
     np.testing.assert_allclose(
         anchors.axes.transpose(0, 2, 1) @ anchors.axes, np.broadcast_to(np.eye(3), anchors.axes.shape), atol=1e-9
     )
+
+
+@pytest.mark.parametrize("space", ["local", "body_local", "root_offset", "root_position"])
+def test_the_part_of_the_body_under_a_garment_anchors_it_as_the_whole_does(bound: tuple[Garment, Body], space: str):
+    """A cuff, cut off the sleeve: normals at its borders know the faces beyond."""
+    garment, body = bound
+    mesh = garment.template
+    assert mesh.uv is not None
+    assert garment.embedding_faces is not None
+    assert garment.embedding_barycentric is not None
+    cuff = mesh.vertices[mesh.faces].mean(axis=1)[:, 1] > 0.35
+    used, faces = np.unique(mesh.faces[cuff], return_inverse=True)
+    worn = replace(
+        garment, loops={}, template=Mesh(mesh.vertices[used], faces.reshape(-1, 3).astype(np.int32), mesh.uv[cuff]),
+        embedding_faces=garment.embedding_faces[used], embedding_barycentric=garment.embedding_barycentric[used],
+        skin_weights=None,
+    )  # fmt: skip
+    layout = OffsetLayout.create(worn, 64)
+    near, part = worn_part(layout, body)
+    assert len(part.template.faces) < 0.7 * len(body.template.faces)
+    whole, small = (
+        each.anchors(bent(skin, 0.8), space)  # pyright: ignore
+        for each, skin in ((layout, body), (near, part))
+    )
+    np.testing.assert_allclose(small.points, whole.points, atol=1e-9)
+    np.testing.assert_allclose(small.axes, whole.axes, atol=1e-6)
 
 
 @pytest.mark.parametrize("space", ["local", "body_local"])

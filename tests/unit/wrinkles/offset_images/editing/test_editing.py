@@ -15,7 +15,8 @@ from capture4d.cli.main import main
 from capture4d.errors import InputError
 from capture4d.mesh_files.meshes import read_mesh
 from tests.unit.wrinkles.offset_images.test_stage import bound_work
-from wrinkles.offset_images.editing.config import ApplyEditsConfig, DrawConfig
+from wrinkles.offset_images.config import RemovalConfig
+from wrinkles.offset_images.editing.config import DrawConfig
 from wrinkles.offset_images.editing.operations import Operation, apply_operation, brush, parse_operations, smoothed
 from wrinkles.offset_images.editing.stage import apply, draw, edit
 from wrinkles.offset_images.layout import OffsetLayout
@@ -57,7 +58,7 @@ def shown(work: WorkFolder) -> np.ndarray:
 
 
 def test_an_untouched_picture_changes_nothing(work: WorkFolder, drawn: Path) -> None:
-    edited = apply(drawn, work, ApplyEditsConfig())
+    edited = apply(drawn, work, RemovalConfig())
     assert edited.removed is None
     np.testing.assert_array_equal(edited.mesh.vertices, registered(work))
 
@@ -70,7 +71,7 @@ def test_cleared_padding_and_fewer_bits_change_nothing(work: WorkFolder, drawn: 
         if image.dtype == np.uint16:
             image = np.round(image / 257.0).astype(np.uint8)
         cv2.imwrite(str(path), image)
-    np.testing.assert_array_equal(apply(drawn, work, ApplyEditsConfig()).mesh.vertices, registered(work))
+    np.testing.assert_array_equal(apply(drawn, work, RemovalConfig()).mesh.vertices, registered(work))
 
 
 def test_another_program_moves_the_cloth_by_what_it_adds(work: WorkFolder, drawn: Path) -> None:
@@ -81,7 +82,7 @@ def test_another_program_moves_the_cloth_by_what_it_adds(work: WorkFolder, drawn
         per_cm = 1.0 if path.suffix == ".tif" else 65535 / 64
         image[shown(work)[..., side], 0] += 3 * per_cm  # OpenCV's first channel is blue
         cv2.imwrite(str(path), image.astype(np.float32) if path.suffix == ".tif" else np.round(image).astype(np.uint16))
-    edited = apply(drawn, work, ApplyEditsConfig(enabled=False))
+    edited = apply(drawn, work, RemovalConfig(enabled=False))
     moved = np.linalg.norm(edited.mesh.vertices - registered(work), axis=1)
     assert edited.moved_share == 1.0
     np.testing.assert_allclose(moved, 0.03, atol=2e-3)
@@ -94,7 +95,7 @@ def test_what_is_pressed_into_the_body_is_taken_out(work: WorkFolder, tmp_path: 
     (tmp_path / "deep.json").write_text(json.dumps(deep))
     (tmp_path / "pressed").mkdir()
     edit(tmp_path / "flat", tmp_path / "deep.json", work, tmp_path / "pressed")
-    inside, out = (apply(tmp_path / "pressed", work, ApplyEditsConfig(enabled=on)).removed for on in (False, True))
+    inside, out = (apply(tmp_path / "pressed", work, RemovalConfig(enabled=on)).removed for on in (False, True))
     assert inside is not None
     assert out is not None
     assert inside.after.inside_percent > 1
@@ -157,6 +158,16 @@ def test_the_commands_in_a_row(work: WorkFolder, tmp_path: Path, capsys) -> None
     assert 0.005 < moved.max() < 0.03
 
 
+def test_a_picture_whose_floats_were_clipped_is_refused(work: WorkFolder, drawn: Path) -> None:
+    """As a program writes it that takes floats for shares of white; a PNG has no such values."""
+    path = picture(drawn)
+    if path.suffix == ".png":
+        pytest.skip("a PNG holds whole numbers")
+    cv2.imwrite(str(path), np.clip(pixels(path), 0, 1))
+    with pytest.raises(InputError, match=r"front\.tif: .*has clipped them; draw with --format png"):
+        apply(drawn, work, RemovalConfig())
+
+
 def test_what_cannot_be_applied_is_told_in_one_line(work: WorkFolder, drawn: Path, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     for name, change, expected in (
@@ -169,7 +180,7 @@ def test_what_cannot_be_applied_is_told_in_one_line(work: WorkFolder, drawn: Pat
         notes = json.loads((copy / name).read_text())
         (copy / name).write_text(json.dumps(notes | change))
         with pytest.raises(InputError, match=expected):
-            apply(copy, work, ApplyEditsConfig())
+            apply(copy, work, RemovalConfig())
         shutil.rmtree(copy)
     small = cv2.resize(pixels(picture(drawn)), (32, 32))
     for image, expected in ((small, "expected 64 x 64 texels"), (None, "no such file"), (b"", "three channels")):
@@ -182,7 +193,7 @@ def test_what_cannot_be_applied_is_told_in_one_line(work: WorkFolder, drawn: Pat
         else:
             path.write_bytes(image)
         with pytest.raises(InputError, match=f"front.*{expected}"):
-            apply(copy, work, ApplyEditsConfig())
+            apply(copy, work, RemovalConfig())
         shutil.rmtree(copy)
     for row, expected in (
         ({"do": "melt"}, r"operations\[0\]\.do: expected shift, inflate, paint, transfer, found 'melt'"),

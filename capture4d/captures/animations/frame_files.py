@@ -13,15 +13,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64
 
 from capture4d.captures.work_folder import ANIMATE, VERDICTS, stack_vertices
 from capture4d.files.atomic import read_json, write_json, write_json_lines, write_npz
+from capture4d.geometry.intersection_removal import Removed
 from capture4d.runs.stage import Stage, StageResult, open_stage
 from capture4d.types import PoseSequence
-from retarget.animation.animator import AnimatedFrame
 
-__all__ = ["FrameFiles", "collect", "motion_files", "open_frames", "write_frame"]
+__all__ = ["FRAMES_AT_ONCE", "AnimatedFrame", "FrameFiles", "collect", "motion_files", "open_frames", "write_frame"]
 
 SCHEMA = 2
 """Of an animation's output."""
@@ -33,6 +33,21 @@ stretch like that. The limits are registration's (`quality.stretch_check`, `qual
 FLIPPED_CHECK_PERCENT = 1.0
 """A frame with more of its faces turned against the body is flagged (registration's `quality.flipped_check_percent`,
 which goes by the scan)."""
+
+
+FRAMES_AT_ONCE = 16
+"""More take more memory; another number, too, changes the last bits of matrix products."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AnimatedFrame:
+    """The garment in one frame."""
+
+    vertices: Float32[np.ndarray, "verts 3"]
+    """Metres, world."""
+    removed: Removed
+    stretch_p99: float
+    """Edge length over the template's on this person, 99th percentile."""
 
 
 def open_frames(
