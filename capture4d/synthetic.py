@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 from capture4d.errors import InputError
 from capture4d.runs.run_log import logged_stage
@@ -13,10 +13,15 @@ from data_synth.config import PRESETS, TRAINING_SETS, BoardConfig, SynthConfig, 
 from data_synth.drapes.config import DrapesConfig
 from data_synth.scanner.config import ScanConfig
 from data_synth.styles.config import STYLE_SETS, StyleSetConfig
-from retarget.mixture.config import StylesConfig
+from retarget.mixture.config import StyleFitConfig, StylesConfig
 from wrinkles.offset_images.config import DrapeOffsetsConfig
 
-__all__ = ["fit_styles", "offsets_predict", "offsets_train", "scan", "synth", "synth_board", "synth_drapes"]
+if TYPE_CHECKING:
+    from retarget.mixture.style_of_work import StyleFound
+
+__all__ = [
+    "fit_style", "fit_styles", "offsets_predict", "offsets_train", "scan", "synth", "synth_board", "synth_drapes",
+]  # fmt: skip
 
 Place: TypeAlias = str | Path
 
@@ -166,3 +171,26 @@ def fit_styles(
     from retarget.mixture.stage import run as stage
 
     return stage(Path(styles), Path(output), config or StylesConfig(), workers=workers, overwrite=overwrite)
+
+
+def fit_style(
+    model: Place,
+    work: Place,
+    output: Place,
+    config: StyleFitConfig | None = None,
+    *,
+    overwrite: bool = False,
+) -> StyleFound:
+    """Find the style and the person of a garment that was registered or scanned; writes style.json.
+
+    Args:
+        model: what `fit_styles` wrote.
+        work: of a take on the model's body, registered, or extracted and tracked.
+        output: style.json; `.fit.style` of what is returned says the same.
+        overwrite: also over a file that holds something else.
+    Raises:
+        InputError: nothing was seen there, or on another body.
+    """
+    from retarget.mixture.style_of_work import run as stage
+
+    return stage(Path(model), Path(work), Path(output), config or StyleFitConfig(), overwrite=overwrite)

@@ -9,8 +9,9 @@ that carries it, as in `capture4d.body.limbs`: from the skin under it at rest th
 over the candidates' edges, downhill in distance, and the nearest point in the triangles around it. Positions are then
 projected as in `capture4d.geometry.intersection_removal`, a few sweeps for each of a few searches.
 
-What this leaves out, and `IntersectionRemoval` does: limbs that do not carry a vertex, faces that the body pokes through
-between their corners, a search that starts anew until everything has settled, and a report. It is for live views.
+What this leaves out, and `IntersectionRemoval` does: limbs that do not carry a vertex, faces that the body pokes
+through between their corners, a search that starts anew until everything has settled, and a report. It is for live
+views.
 
 Letters: V vertices of the garment, C candidates, J joints.
 """
