@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks.metric import Metric
 from capture4d.body.anny import load_anny
-from data_synth.drapes.config import DrapesConfig, GarmentName
+from data_synth.drapes.config import DrapesConfig
 from data_synth.drapes.draping import Draper
 from data_synth.drapes.quality import face_area_ratios, measure_drape
 from data_synth.styles.config import STYLE_SETS
@@ -34,21 +34,19 @@ def run(*, quick: bool = False, seed: int = 3, vertices: int = 1200, styles: int
         styles: at random, of each garment.
     """
     if quick:
-        return _measured("tiny-style-space", "skirt", seed, vertices=300, styles=12)
-    metrics = []
-    for preset, garment in (("tshirt-style-space", "tshirt"), ("tiny-style-space", "skirt")):
-        metrics += _measured(preset, garment, seed, vertices=vertices, styles=styles)
-    return metrics
+        return _measured("tiny-style-space", seed, vertices=300, styles=12)
+    presets = "tshirt-style-space", "tiny-style-space"
+    return [each for preset in presets for each in _measured(preset, seed, vertices=vertices, styles=styles)]
 
 
-def _measured(preset: str, garment: GarmentName, seed: int, *, vertices: int, styles: int) -> list[Metric]:
+def _measured(preset: str, seed: int, *, vertices: int, styles: int) -> list[Metric]:
     config, body, begun = STYLE_SETS[preset], load_anny(), time.process_time()
     still = np.repeat(np.eye(3)[None], len(body.joint_names), axis=0)
     rng = np.random.default_rng(seed)
 
     def draper(cut: Mapping[str, float]) -> Draper:
         texts = tuple(f"{name}={value!r}" for name, value in cut.items())
-        return Draper(DrapesConfig(garment=garment, style=texts, vertices=vertices), body)
+        return Draper(DrapesConfig(garment=config.garment, style=texts, vertices=vertices), body)
 
     def drape(cuts: Sequence[Mapping[str, float]]) -> np.ndarray:
         return np.stack([draper(cut).drape(still).vertices for cut in cuts])
@@ -64,11 +62,10 @@ def _measured(preset: str, garment: GarmentName, seed: int, *, vertices: int, st
         inside.append(quality.inside_percent)
         whole.append(areas.min() >= AREAS[0] and areas.max() <= AREAS[1])
     found_metrics = [
-        Metric("third_cosine", float(cosines[min(2, len(cosines) - 1)]), "", "higher"),
-        Metric("last_cosine", float(cosines[-1]), "", "higher"),
+        *(Metric(f"cosine_{k}", float(cosine), "", "higher") for k, cosine in enumerate(cosines, 1)),
         Metric("two_components_explain", float(space.explained[:2].sum()), "", "higher"),
         Metric("whole_percent", 100 * float(np.mean(whole)), "%", "higher"),
         Metric("inside_percent", float(np.mean(inside)), "%"),
         Metric("cpu_s", time.process_time() - begun, "s"),
     ]
-    return [Metric(f"{garment}_{each.key}", each.value, each.unit, each.better) for each in found_metrics]
+    return [Metric(f"{config.garment}_{each.key}", each.value, each.unit, each.better) for each in found_metrics]

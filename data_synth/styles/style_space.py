@@ -119,7 +119,7 @@ def find_space(
     mean = vertices.mean(axis=0, dtype=np.float64)
     flat = vertices.reshape(len(vertices), -1) - mean.reshape(-1)
     wanted = min(MOST_COMPONENTS, len(numbers))
-    directions, values = exact_directions(lambda block: flat[block], *flat.shape, wanted)
+    directions, values = exact_directions(lambda block: flat[block], len(flat), flat.shape[1], wanted)
     deviations = values / np.sqrt(len(flat))
     scores = flat @ directions.T / deviations
     given = np.asarray(patterns, np.float64)

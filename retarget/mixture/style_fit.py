@@ -321,7 +321,7 @@ class _Search:
             targets.append(points)
         if not corners:
             return _Rows(np.zeros((0, 3), int), np.zeros((0, 3)), np.zeros((0, 3)), None, 0.0)
-        return _Rows(*(np.concatenate(each) for each in (corners, weights, targets)), None, BORDER_SHARE)
+        return _Rows(np.concatenate(corners), np.concatenate(weights), np.concatenate(targets), None, BORDER_SHARE)
 
     def _surface_rows(self, placed: _Placed, vertices: np.ndarray) -> _Rows:
         """Points of the seen surface to planes through them: the nearest point of the model that faces as they do."""

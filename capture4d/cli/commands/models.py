@@ -102,10 +102,11 @@ def _style(texts: tuple[str, ...]) -> dict[str, float] | tuple[float, ...] | Non
     """A style as it was given: numbers by name, numbers in their order, or what a style.json says; None without."""
     if not texts:
         return None
-    if texts[0].startswith("@"):
-        if len(texts) > 1:
-            raise InputError(f"--style: expected one file, or numbers, found {texts[1]!r} after {texts[0]!r}")
-        return _style_of_file(Path(texts[0][1:]))
+    first, *others = texts
+    if first.startswith("@"):
+        if others:
+            raise InputError(f"--style: expected one file, or numbers, found {others[0]!r} after {first!r}")
+        return _style_of_file(Path(first[1:]))
     if not any("=" in text for text in texts):
         return tuple(_finite(part, texts) for text in texts for part in text.split(","))
     found = {}

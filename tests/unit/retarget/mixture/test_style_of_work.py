@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,9 +18,12 @@ from capture4d.files.records import load_garment, save_garment, save_poses
 from capture4d.pipeline import fit_style
 from capture4d.runs.stage import open_stage
 from capture4d.types import GarmentScan, Mesh
+from retarget.mixture import style_of_work
 from retarget.mixture.config import StyleFitConfig, StylesConfig
 from retarget.mixture.model_files import load_styled_garment
 from retarget.mixture.stage import run as fit_styles
+from retarget.mixture.style_fit import SeenFrame, StyleFit
+from retarget.mixture.styled_garment import StyledGarment
 from tests.unit.retarget.mixture.conftest import ALONG, AROUND, made_style_set, motion, write_style_set
 
 ANGLES = [0.05, 0.3, 0.62, 0.9]
@@ -106,14 +111,12 @@ def test_the_style_of_scans_is_found(styled: Path, tmp_path: Path):
 def test_a_garment_beyond_what_was_learned_is_exit_3(
     styled: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
-    from retarget.mixture import style_of_work
+    def grown(garment: StyledGarment, frames: Sequence[SeenFrame], **others: Any) -> StyleFit:
+        larger = [replace(each, mesh=each.mesh.with_vertices(each.mesh.vertices * np.float32(1.4))) for each in frames]
+        return fit(garment, larger, **others)
 
-    def grown(*args):
-        frame = seen(*args)
-        return replace(frame, mesh=frame.mesh.with_vertices(frame.mesh.vertices * np.float32(1.4)))
-
-    seen = style_of_work._of_registration
-    monkeypatch.setattr(style_of_work, "_of_registration", grown)
+    fit = style_of_work.fit_style
+    monkeypatch.setattr(style_of_work, "fit_style", grown)
     words = "--output", tmp_path / "style.json", "--frames", "1"
     assert run("fit-style", styled / "model", styled / "work", *words) == 3
     assert "ran into the end of what was learned" in capsys.readouterr().err
