@@ -22,6 +22,7 @@ from pathlib import Path
 from rich.console import Console
 
 from benchmarks.metric import Metric
+from benchmarks.style_use import fit_metrics, frame_metrics, prototype_metrics
 from capture4d.cache import user_cache_folder
 from capture4d.captures.drapes.style_sets import read_style_set
 from data_synth.drapes.stage import SCHEMA as DRAPES_SCHEMA
@@ -33,19 +34,27 @@ from retarget.mixture.config import PRESETS, StylesConfig
 from retarget.mixture.evaluation import PartErrors, Unposed, measure, unposed_by
 from retarget.mixture.learning import learn_styles
 from retarget.mixture.lesson import Part, StyleLesson, style_lesson
+from retarget.mixture.styled_garment import StyledGarment
 
 KEYS: Mapping[Part, str] = {"train-test": "train_test", "test-train": "test_train", "test-test": "test_test"}
 """Parts that tell something: the first is what was learned from."""
 
 
 def run(
-    *, quick: bool = False, seeds: tuple[int, ...] = (), paper: bool = False, fresh: bool = False, workers: int = 2
+    *,
+    quick: bool = False,
+    seeds: tuple[int, ...] = (),
+    styles: Path | None = None,
+    paper: bool = False,
+    fresh: bool = False,
+    workers: int = 2,
 ) -> list[Metric]:
-    """Learn a style set with the default, the paper's mixture and baselines.
+    """Learn a style set with the default, the paper's mixture and baselines; find styles again, and time a frame.
 
     Args:
         quick: `tiny-styles`, half a minute of drapes, in place of `tshirt-styles`.
         seeds: of the drapes; errors are means over all of them. None: two sets with `--quick`, else one.
+        styles: a style set that is there, as `synth-drapes --preset` makes one, in place of those.
         paper: learn the recipe of `--preset paper` as well, with its large networks.
         fresh: make the drapes anew, though they are in the cache folder: as after a change of the solver.
     """
@@ -53,14 +62,19 @@ def run(
     errors: dict[str, list[Mapping[Part, PartErrors]]] = {}
     notes = []
     begun = time.process_time()
-    for seed in seeds or ((0, 1) if quick else (0,)):
-        lesson = style_lesson(read_style_set(_drapes(replace(base, seed=seed), fresh=fresh, workers=workers)))
-        predictions, note = _predictions(lesson, paper=paper)
+    use: dict[str, list[Metric]] = {}
+    for seed in seeds or ((0, 1) if quick and styles is None else (0,)):
+        folder = styles or _drapes(replace(base, seed=seed), fresh=fresh, workers=workers)
+        lesson = style_lesson(read_style_set(folder))
+        predictions, note, garment = _predictions(lesson, paper=paper)
         notes.append(note)
+        for metric in (*prototype_metrics(lesson), *frame_metrics(garment, lesson), *fit_metrics(garment, lesson)):
+            use.setdefault(metric.key, []).append(metric)
         for name, predict in predictions.items():
             errors.setdefault(name, []).append(measure(lesson, predict))
     return [
         *_metrics(errors),
+        *(replace(found[0], value=_mean([each.value for each in found])) for found in use.values()),
         Metric("effective_prototypes", _mean([note["effective_prototypes"] for note in notes]), "", "higher"),
         Metric("a_pose_left_out_mm", _mean([note["a_pose"]["left_out_rms_mm"] for note in notes]), "mm"),
         Metric("cpu_s", time.process_time() - begun, "s"),
@@ -75,8 +89,8 @@ def _drapes(config: StyleSetConfig, *, fresh: bool, workers: int) -> Path:
     return folder
 
 
-def _predictions(lesson: StyleLesson, *, paper: bool) -> tuple[dict[str, Unposed], dict]:
-    """Everything that is compared, and how default and mixture were learned."""
+def _predictions(lesson: StyleLesson, *, paper: bool) -> tuple[dict[str, Unposed], dict, StyledGarment]:
+    """Everything that is compared, how default and mixture were learned, and the default."""
     configs: dict[str, StylesConfig] = {
         "default": StylesConfig(),
         **BASELINES,
@@ -84,11 +98,11 @@ def _predictions(lesson: StyleLesson, *, paper: bool) -> tuple[dict[str, Unposed
         "mixture_over_drape": StylesConfig(method="mixture"),
         **({"paper": PRESETS["paper"]} if paper else {}),
     }
-    found, note = {}, {}
+    found, note, learned = {}, {}, {}
     with tempfile.TemporaryDirectory() as folder:
         for name, config in configs.items():
             garment, said, _ = learn_styles(lesson, config, Path(folder) / name)
-            found[name] = unposed_by(garment)
+            found[name], learned[name] = unposed_by(garment), garment
             note = {**said, **note}
             if name == "default":
                 found |= {
@@ -96,7 +110,7 @@ def _predictions(lesson: StyleLesson, *, paper: bool) -> tuple[dict[str, Unposed
                     "nearest": nearest_drape(lesson, garment),
                     "blended": blended_prototypes(lesson, garment),
                 }
-    return found, note
+    return found, note, learned["default"]
 
 
 def _metrics(errors: Mapping[str, list[Mapping[Part, PartErrors]]]) -> list[Metric]:

@@ -25,6 +25,7 @@ from capture4d.runs.processes.pool import kept_workers
 from capture4d.runs.run_log import logged_stage
 from capture4d.runs.stage import StageResult
 from capture4d.synthetic import (
+    fit_style,
     fit_styles,
     offsets_apply,
     offsets_draw,
@@ -54,10 +55,10 @@ if TYPE_CHECKING:
     from retarget.animation.stage import Wearer
 
 __all__ = [
-    "animate", "calibrate", "check", "check_rig", "compare", "diff", "export", "extract", "fit", "fit_styles",
-    "import_meshes", "offsets_apply", "offsets_draw", "offsets_edit", "offsets_predict", "offsets_train", "register",
-    "register_mesh", "report", "run", "scan", "score", "status", "synth", "synth_board", "synth_drapes", "template",
-    "track", "wrinkles_apply", "wrinkles_maps", "wrinkles_offsets", "wrinkles_train",
+    "animate", "calibrate", "check", "check_rig", "compare", "diff", "export", "extract", "fit", "fit_style",
+    "fit_styles", "import_meshes", "offsets_apply", "offsets_draw", "offsets_edit", "offsets_predict", "offsets_train",
+    "register", "register_mesh", "report", "run", "scan", "score", "status", "synth", "synth_board", "synth_drapes",
+    "template", "track", "wrinkles_apply", "wrinkles_maps", "wrinkles_offsets", "wrinkles_train",
 ]  # fmt: skip
 
 

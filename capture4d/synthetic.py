@@ -14,16 +14,17 @@ from data_synth.config import PRESETS, TRAINING_SETS, BoardConfig, SynthConfig, 
 from data_synth.drapes.config import DrapesConfig
 from data_synth.scanner.config import ScanConfig
 from data_synth.styles.config import STYLE_SETS, StyleSetConfig
-from retarget.mixture.config import StylesConfig
+from retarget.mixture.config import StyleFitConfig, StylesConfig
 from wrinkles.offset_images.config import DrapeOffsetsConfig, OffsetConfig, PredictOffsetsConfig, RemovalConfig
 from wrinkles.offset_images.editing.config import DrawConfig
 
 if TYPE_CHECKING:
+    from retarget.mixture.style_of_work import StyleFound
     from wrinkles.offset_images.editing.stage import Edited
 
 __all__ = [
-    "fit_styles", "offsets_apply", "offsets_draw", "offsets_edit", "offsets_predict", "offsets_train", "scan", "synth",
-    "synth_board", "synth_drapes", "wrinkles_offsets",
+    "fit_style", "fit_styles", "offsets_apply", "offsets_draw", "offsets_edit", "offsets_predict", "offsets_train",
+    "scan", "synth", "synth_board", "synth_drapes", "wrinkles_offsets",
 ]  # fmt: skip
 
 Place: TypeAlias = str | Path
@@ -255,3 +256,26 @@ def fit_styles(
     from retarget.mixture.stage import run as stage
 
     return stage(Path(styles), Path(output), config or StylesConfig(), workers=workers, overwrite=overwrite)
+
+
+def fit_style(
+    model: Place,
+    work: Place,
+    output: Place,
+    config: StyleFitConfig | None = None,
+    *,
+    overwrite: bool = False,
+) -> StyleFound:
+    """Find the style and the person of a garment that was registered or scanned; writes style.json.
+
+    Args:
+        model: what `fit_styles` wrote.
+        work: of a take on the model's body, registered, or extracted and tracked.
+        output: style.json; `.fit.style` of what is returned says the same.
+        overwrite: also over a file that holds something else.
+    Raises:
+        InputError: nothing was seen there, or on another body.
+    """
+    from retarget.mixture.style_of_work import run as stage
+
+    return stage(Path(model), Path(work), Path(output), config or StyleFitConfig(), overwrite=overwrite)

@@ -25,7 +25,7 @@ from capture4d.geometry.triangles import closest_in_triangle, row3
 from capture4d.heavy_imports import njit
 from capture4d.types import Body
 
-__all__ = ["LimbSurfaces", "WornBody", "limbs_of_joints"]
+__all__ = ["LimbSurfaces", "WornBody", "carrying_skin", "limbs_of_joints"]
 
 MEDIAN_M = 0.02
 """A joint as near to the root's median plane is in it."""
@@ -59,6 +59,23 @@ def _shares(weights: np.ndarray, limbs: np.ndarray) -> np.ndarray:
     return np.stack([weights[:, limbs == limb].sum(axis=1) for limb in range(limbs.max(initial=0) + 1)], axis=1)
 
 
+def carrying_skin(
+    person: ShapedBody, garment: Float[np.ndarray, "verts 3"], skin_weights: Float[np.ndarray, "verts joints"]
+) -> Int64[np.ndarray, " verts"]:
+    """The body vertex that lies under each vertex of a garment in the rest pose and moves as it does.
+
+    Args:
+        garment: its vertices in the person's rest pose, metres.
+        skin_weights: of the garment, over the body's joints.
+    """
+    moving = np.flatnonzero(skin_weights.max(axis=0, initial=0.0) > 0)
+    used = np.unique(person.body.template.faces)
+    skin = UNLIKE_WEIGHTS_M * person.body.skin_weights[used][:, moving]
+    cloth = UNLIKE_WEIGHTS_M * skin_weights[:, moving]
+    _, nearest = KDTree(np.hstack([person.vertices[used], skin])).query(np.hstack([garment, cloth]))
+    return used[nearest].astype(np.int64)
+
+
 class WornBody:
     """A garment on one person: what all frames share.
 
@@ -83,16 +100,8 @@ class WornBody:
             _shares(skin_weights, limbs) > CARRIED_SHARE,
             tuple(faces[limb_of_face == limb] for limb in range(limbs.max() + 1)),
         )
-        self._start = self._carriers(person, garment, skin_weights)
-
-    def _carriers(self, person: ShapedBody, garment: np.ndarray, skin_weights: np.ndarray) -> np.ndarray:
-        """A body face under each vertex of the garment, (V,) int32."""
-        moving = np.flatnonzero(skin_weights.max(axis=0, initial=0.0) > 0)
-        used = np.unique(self._worn.faces)
-        skin = UNLIKE_WEIGHTS_M * person.body.skin_weights[used][:, moving]
-        cloth = UNLIKE_WEIGHTS_M * skin_weights[:, moving]
-        _, nearest = KDTree(np.hstack([person.vertices[used], skin])).query(np.hstack([garment, cloth]))
-        return self._worn.fans[self._worn.offsets[used[nearest]]]
+        under = carrying_skin(person, garment, skin_weights)
+        self._start = self._worn.fans[self._worn.offsets[under]]
 
     def posed(self, vertices: Float[np.ndarray, "skin 3"]) -> LimbSurfaces:
         """The body in one pose."""

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int32
 from scipy.spatial.transform import Rotation
 
-from capture4d.body.skinning import PosedBody, ShapedBody, with_pose
+from capture4d.body.skinning import PosedBody, ShapedBody, sparse_weights, with_pose
 from capture4d.body.surface_kernels import add_up_rows, fill_rows, nearest_samples, skin_sparse, spread_samples
 from capture4d.geometry.mesh import face_areas
 from capture4d.geometry.mesh_kernels import vertex_normals_kernel
@@ -113,9 +113,7 @@ class Matches:
 
 def tracked_body(body: Body, *, samples: int = SURFACE_SAMPLES) -> TrackedBody:
     """Sparse skin weights and surface samples of a body."""
-    influences = int((body.skin_weights > 0).sum(axis=1).max())
-    order = np.argsort(-body.skin_weights, axis=1, kind="stable")[:, :influences]
-    weights = np.take_along_axis(body.skin_weights, order, axis=1).astype(np.float64)
+    joints, weights = sparse_weights(body.skin_weights)
     areas = np.cumsum(face_areas(body.template.vertices.astype(np.float64), body.template.faces))
     rng = np.random.default_rng(0)
     at = (np.arange(samples) + rng.random(samples)) / samples * areas[-1]
@@ -123,7 +121,7 @@ def tracked_body(body: Body, *, samples: int = SURFACE_SAMPLES) -> TrackedBody:
     groups, starts, members = _groups(body)
     return TrackedBody(
         body=body,
-        vertex_joints=order.astype(np.int32),
+        vertex_joints=joints,
         vertex_weights=weights,
         shape_directions=np.ascontiguousarray(np.moveaxis(body.shape_directions, 0, 2), np.float64),
         sample_faces=np.minimum(np.searchsorted(areas, at), len(areas) - 1).astype(np.int32),

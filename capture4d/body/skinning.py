@@ -17,7 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float, Float64, Int32
 
 from capture4d.errors import InputError
 from capture4d.types import Body, PoseSequence
@@ -28,6 +28,7 @@ __all__ = [
     "blend_transforms",
     "pose_frame",
     "skin",
+    "sparse_weights",
     "unskin",
     "with_pose",
     "with_shape",
@@ -164,3 +165,12 @@ def _near_singular(matrices: Float64[np.ndarray, "verts 3 3"]) -> Bool[np.ndarra
     flagged = ~(norms < SINGULAR_CONDITION * determinant)
     flagged[flagged] = np.linalg.cond(matrices[flagged]) > SINGULAR_CONDITION
     return flagged
+
+
+def sparse_weights(
+    weights: Float[np.ndarray, "verts joints"],
+) -> tuple[Int32[np.ndarray, "verts influences"], Float64[np.ndarray, "verts influences"]]:
+    """Joints of each vertex by falling weight, and these weights; zero where a vertex has fewer than others."""
+    most = max(int((weights > 0).sum(axis=1).max(initial=0)), 1)
+    order = np.argsort(-weights, axis=1, kind="stable")[:, :most]
+    return order.astype(np.int32), np.take_along_axis(weights, order, axis=1).astype(np.float64)

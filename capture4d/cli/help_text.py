@@ -23,8 +23,9 @@ _GROUPS: Mapping[str, Sequence[str]] = {
         "run", "check", "template", "extract", "track", "register", "report", "status", "diff",
     ),
     "learn and animate:": (
-        "fit", "fit-styles", "animate", "wrinkles maps", "wrinkles train", "wrinkles apply", "wrinkles offsets",
-        "compare", "offsets train", "offsets predict", "offsets draw", "offsets edit", "offsets apply",
+        "fit", "fit-styles", "fit-style", "animate", "wrinkles maps", "wrinkles train", "wrinkles apply",
+        "wrinkles offsets", "compare", "offsets train", "offsets predict", "offsets draw", "offsets edit",
+        "offsets apply",
     ),
     "out to other tools, and back:": ("export", "import", "score"),
     "two meshes:": ("register-mesh",),
@@ -67,9 +68,11 @@ EXAMPLES: Mapping[str, Sequence[str]] = {
     "diff": ("diff before after", "diff before after --fail-if-worse fit_mean_mm=5"),
     "fit": ("fit work", "fit walk run jump --output shirt"),
     "fit-styles": ("fit-styles styles --output model", "fit-styles styles --output model --preset paper"),
+    "fit-style": ("fit-style model work --output style.json",),
     "animate": (
         "animate work --poses motion.bvh --output dance --beta 1.5 2.0",
         "animate model --poses motion.bvh --output dance --style length=0.7",
+        "animate model --poses motion.bvh --output dance --style @style.json",
     ),
     "wrinkles maps": ("wrinkles maps work",),
     "wrinkles train": ("wrinkles train work --output model",),

@@ -24,7 +24,7 @@ from capture4d.cli.commands.drape_offsets import OffsetsPredict, OffsetsTrain
 from capture4d.cli.commands.exchange import Export, Import, Score
 from capture4d.cli.commands.files import ConvertBody, ConvertPoses, ConvertRig, RegisterMesh, Template
 from capture4d.cli.commands.folders import Diff, Status
-from capture4d.cli.commands.models import Animate, Fit, FitStyles
+from capture4d.cli.commands.models import Animate, Fit, FitStyle, FitStyles
 from capture4d.cli.commands.offsets import OffsetsApply, OffsetsDraw, OffsetsEdit
 from capture4d.cli.commands.stages import Extract, Register, Report, Run, Track
 from capture4d.cli.commands.synthesis import Demo, Scan, Synth, SynthBoard, SynthDrapes
@@ -62,6 +62,7 @@ COMMANDS: Mapping[str, Any] = {
     "diff": Diff,
     "fit": Fit,
     "fit-styles": FitStyles,
+    "fit-style": FitStyle,
     "animate": Animate,
     "wrinkles maps": WrinklesMaps,
     "wrinkles train": WrinklesTrain,
@@ -85,7 +86,7 @@ COMMANDS: Mapping[str, Any] = {
     "doctor": Doctor,
 }
 
-_WRITE_FILES = (Check, Template, RegisterMesh, Calibrate, ConvertBody, ConvertPoses, ConvertRig, Diff,
+_WRITE_FILES = (Check, FitStyle, Template, RegisterMesh, Calibrate, ConvertBody, ConvertPoses, ConvertRig, Diff,
                 OffsetsDraw, OffsetsEdit, OffsetsApply)  # fmt: skip
 """Commands whose output is a file among others, or a folder that comes to be at the end; that of the rest is a folder
 of their own."""

@@ -24,7 +24,7 @@ from jaxtyping import Bool, Float, Float64, Int32
 from capture4d.geometry.mesh import doubled_area_vectors, edge_lengths, unique_edges, vertex_adjacency
 from capture4d.heavy_imports import njit
 
-__all__ = ["Contacts", "IntersectionRemoval", "Penetration", "RemovalSettings", "Removed", "Surroundings"]
+__all__ = ["Contacts", "IntersectionRemoval", "Penetration", "RemovalSettings", "Removed", "Surroundings", "project"]
 
 EDGE_MIDDLES = np.array([[1, 1, 0], [0, 1, 1], [1, 0, 1], [2 / 3, 2 / 3, 2 / 3]]) / 2
 """Where a face is probed: the middles of its edges, and its own."""
@@ -205,7 +205,7 @@ class IntersectionRemoval:
             else:
                 low, high = np.full(len(start), -np.inf), np.full(len(start), np.inf)
             was, spread = points.copy(), config.spread * (1 - (turn + 1) / config.rounds)
-            _sweep(
+            project(
                 points, start, self._edges, self._longest, shortest, self._offsets, self._around,
                 found.feet, found.normals, found.outwards, low, high, spread, config.sweeps,
             )  # fmt: skip
@@ -240,7 +240,7 @@ def _bounds(points: np.ndarray, found: Contacts, margin: float, lifted: np.ndarr
     What is outside may come no nearer, up to the margin; what is inside is put there. Between two limbs that are closer
     than two margins it goes to the middle. Where the limbs overlap, the other one is let through.
     """
-    present = np.einsum("vx,vx->v", points - found.feet, found.normals)  # as `_sweep` measures it
+    present = np.einsum("vx,vx->v", points - found.feet, found.normals)  # as `project` measures it
     low = np.where(found.heights < 0, margin, np.minimum(present, margin))
     half = found.room / 2
     high = np.where(found.overlapping, np.inf, np.maximum(found.room - margin, half))
@@ -248,7 +248,7 @@ def _bounds(points: np.ndarray, found: Contacts, margin: float, lifted: np.ndarr
 
 
 @njit(cache=True)
-def _sweep(
+def project(
     points, start, edges, longest, shortest, offsets, around, feet, normals, outwards, low, high, spread, sweeps
 ):
     """Move `points` in place: edges first, then each vertex with its neighbours and between its bounds."""

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import field
-from typing import Literal
+from typing import Annotated, Literal
 
-from capture4d.settings import Count, Number, Seed, Whole, settings
+from capture4d.settings import Count, Number, Range, Seed, Whole, settings
 from data_synth.config import Vertices
 from data_synth.drapes.config import GarmentName, PoseConfig, SolverConfig
 
@@ -21,7 +21,15 @@ class StyleSetConfig:
     styles: dict[str, tuple[Number, ...]] = field(
         default_factory=lambda: {"length": (0.45, 0.9), "hem_width": (0.6, 1.0)}
     )
-    """Values of each number of the pattern that varies, ascending; all combinations are tried."""
+    """Values of each number of the pattern that varies, ascending; all combinations are tried. With `components`, only
+    the least and the most count."""
+    components: Annotated[int, Range(least=0, most=4)] = 0
+    """Principal components of the garments in the A-pose that are the numbers of a style instead; 0 for the pattern's
+    own."""
+    drawn: Annotated[int, Range(least=6)] = 40
+    """Garments in each of the two rounds in which components are found."""
+    levels: Annotated[int, Range(least=2)] = 5
+    """Values of each component, evenly from -1.5 to 1.5 standard deviations."""
     shapes: tuple[tuple[Number, ...], ...] = ((0.0, 0.0), (1.0, -1.0), (-1.0, 1.0))
     """People, each by the shape in standard deviations; all wear every style. The first is the mean person."""
     prototypes: Count = 3
@@ -67,5 +75,28 @@ STYLE_SETS: dict[str, StyleSetConfig] = {
         seen_poses=20,
         vertices=2500,
     ),
+    "tiny-style-space": StyleSetConfig(
+        garment="skirt",
+        styles={"length_m": (0.35, 0.6), "flare": (1.2, 1.9), "size": (0.97, 1.08)},
+        components=2,
+        drawn=24,
+        levels=3,
+        shapes=((0.0, 0.0), (1.0, 0.0)),
+        vertices=300,
+    ),
+    "tshirt-style-space": StyleSetConfig(
+        garment="tshirt",
+        styles={"size": (0.92, 1.12), "ease": (0.12, 0.35), "sleeve_length": (0.3, 1.02), "hem_drop_m": (0.04, 0.18)},
+        components=2,
+        shapes=_PAPER_SHAPES,
+        prototypes=12,
+        poses=700,
+        unseen_poses=60,
+        test_pairs=8,
+        off_grid=4,
+        seen_poses=20,
+        vertices=2500,
+    ),
 }
-"""`tiny-styles` shows that everything works; `tshirt-styles` is 25 styles on 9 people, as many as the paper has."""
+"""`tiny-styles` shows that everything works; `tshirt-styles` is 25 styles on 9 people, as many as the paper has.
+`tiny-style-space` and `tshirt-style-space` are likewise, with principal components for numbers of a style."""

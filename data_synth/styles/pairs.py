@@ -6,7 +6,7 @@ References: TailorNet (CVPR 2020), sections 4.4 (prototypes), 5.2 (the grid of s
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise, product
 from typing import Literal
 
@@ -17,8 +17,9 @@ from capture4d.errors import InputError
 from capture4d.learning.convex_fits import furthest_first
 from data_synth.drapes.config import STYLES
 from data_synth.styles.config import StyleSetConfig
+from data_synth.styles.style_space import LIMIT, StyleSpace
 
-__all__ = ["Pair", "choose_prototypes", "draw_test_pairs", "grid", "ranges_of", "require_possible"]
+__all__ = ["Pair", "choose_prototypes", "draw_test_pairs", "grid", "offered", "ranges_of", "require_possible"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,13 +27,14 @@ class Pair:
     """A style on a person."""
 
     style: tuple[float, ...]
-    """Values of the numbers that vary, in the order of the settings."""
+    """Values of the numbers that vary, in the order of the settings; or components, in standard deviations."""
     shape: tuple[float, ...]
     """In standard deviations."""
 
-    def style_texts(self, config: StyleSetConfig) -> tuple[str, ...]:
-        """As `synth-drapes` takes them."""
-        return tuple(f"{name}={value!r}" for name, value in zip(config.styles, self.style, strict=True))
+    def style_texts(self, config: StyleSetConfig, space: StyleSpace | None = None) -> tuple[str, ...]:
+        """Numbers of the pattern, as `synth-drapes` takes them."""
+        cut = dict(zip(config.styles, self.style, strict=True)) if space is None else space.cut(self.style)
+        return tuple(f"{name}={value!r}" for name, value in cut.items())
 
 
 def require_possible(config: StyleSetConfig) -> None:
@@ -50,7 +52,10 @@ def require_possible(config: StyleSetConfig) -> None:
             raise InputError(f"styles.{name}: expected two or more ascending values, found {values}")
     if any(config.shapes[0]) or len({len(shape) for shape in config.shapes}) > 1:
         raise InputError("shapes: expected the mean person first, and as many numbers for all, found others")
-    tried = len(grid(config))
+    tried = len(grid(offered(config)))
+    if config.components > len(config.styles):
+        raise InputError(f"components: expected at most {len(config.styles)}, the numbers that vary; "
+                         f"found {config.components}")  # fmt: skip
     if config.prototypes + config.test_pairs > tried:
         raise InputError(
             f"prototypes, test_pairs: expected at most the {tried} pairs of styles and shapes, "
@@ -58,6 +63,19 @@ def require_possible(config: StyleSetConfig) -> None:
         )
     if config.seen_poses > config.poses:
         raise InputError(f"seen_poses: expected at most the {config.poses} poses, found {config.seen_poses}")
+
+
+def offered(config: StyleSetConfig, names: Sequence[str] | None = None) -> StyleSetConfig:
+    """The settings with what is varied in the end: the numbers of the pattern, or components between their limits.
+
+    Args:
+        names: of the components; the first are taken.
+    """
+    if not config.components:
+        return config
+    levels = tuple(np.linspace(-LIMIT, LIMIT, config.levels).tolist())
+    called = names or [f"component-{k}" for k in range(1, config.components + 1)]
+    return replace(config, styles=dict.fromkeys(called[: config.components], levels))
 
 
 def grid(config: StyleSetConfig) -> list[Pair]:

@@ -56,8 +56,9 @@ class Wearer:
     beta: Sequence[float] | None = None
     """Shape coefficients of the person; without them those of the poses.npz beside `body`, and without that as well the
     mean of `body`."""
-    style: Mapping[str, float] | None = None
-    """Numbers of the pattern by name, of a garment with styles alone; in the middle of their range without."""
+    style: Mapping[str, float] | Sequence[float] | None = None
+    """Numbers of the style, by name or in their order, of a garment with styles alone; in the middle of their range
+    without."""
 
 
 def run(

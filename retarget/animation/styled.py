@@ -44,7 +44,7 @@ def run(
     config: AnimateConfig,
     *,
     beta: Sequence[float],
-    style: Mapping[str, float],
+    style: Mapping[str, float] | Sequence[float],
     workers: int,
     overwrite: bool,
 ) -> StageResult:
@@ -60,6 +60,7 @@ def run(
         if getattr(config, name) != usual:
             raise InputError(f"--{name}: expected none, for a garment with styles has none to choose")
     known = load_styled_garment(model)
+    style = style if isinstance(style, Mapping) else known.ranges.named(style)
     worn = known.worn(beta, style, config)
     motion = _motion(known, poses, worn, config.fps)
     files = [model / name for name in MODEL_FILES]

@@ -17,6 +17,7 @@ __all__ = [
     "MixtureConfig",
     "NetworkConfig",
     "SplitConfig",
+    "StyleFitConfig",
     "StylesConfig",
 ]
 
@@ -136,6 +137,20 @@ class StylesConfig:
     """Epochs; they change nothing in the result."""
     seed: Seed = 0
     """Of the first weights, the order of the drapes and what is held back for validation."""
+
+
+@settings
+class StyleFitConfig:
+    """Finding the style of a garment that was seen."""
+
+    source: Literal["auto", "registration", "scans"] = "auto"
+    """What it is fitted to: registered frames or, as `auto` does where nothing is registered, the scans' garments."""
+    frames: str | None = None
+    """Only these frames of the take, such as 1,5,10-20; as many as `count` if absent."""
+    count: Count = 4
+    """Frames, evenly over the take, that share one style."""
+    pose: bool = True
+    """Turn the joints that move the garment a little from the tracked pose, if that explains more."""
 
 
 _RELEASED = NetworkConfig(

@@ -138,7 +138,7 @@ def _unposed(pair: StylePair, garment: Garment, styles: StyleSet) -> PairDrapes:
     return PairDrapes(
         name=pair.name,
         test=pair.role == "test",
-        numbers=styles.ranges.numbers(drapes.style, drapes.shape),
+        numbers=styles.ranges.numbers(pair.style, drapes.shape),
         person=person,
         under=person_under(garment, drapes.body, drapes.shape),
         canonical=pair.canonical.astype(np.float64),

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, Int32
 from torch import nn
 
+from capture4d.body.body_candidates import BodyCandidates
 from capture4d.body.limbs import WornBody
 from capture4d.body.skinning import PosedBody, ShapedBody, skin, with_pose, with_shape
 from capture4d.captures.animations.known_poses import PoseRange
@@ -70,7 +71,7 @@ class StyledGarment:
         self,
         pose: PoseSequence,
         beta: Sequence[float] | Float[np.ndarray, " betas"] = (),
-        style: Mapping[str, float] | None = None,
+        style: Mapping[str, float] | Sequence[float] | None = None,
         *,
         remove_intersections: bool = True,
     ) -> Float32[np.ndarray, "frames verts 3"]:
@@ -80,7 +81,7 @@ class StyledGarment:
 
         Args:
             beta: shape coefficients of the person, of which the last may be left out.
-            style: numbers of the pattern, by name; in the middle of their range if left out.
+            style: numbers of the style, by name, or in the order of `ranges`; in the middle of their range if left out.
             remove_intersections: move what is inside the body out of it.
         Raises:
             InputError: the poses are of another skeleton, or style or shape are outside what was learned.
@@ -97,7 +98,7 @@ class StyledGarment:
     def worn(
         self,
         beta: Sequence[float] | Float[np.ndarray, " betas"] = (),
-        style: Mapping[str, float] | None = None,
+        style: Mapping[str, float] | Sequence[float] | None = None,
         config: AnimateConfig | None = None,
     ) -> WornGarment:
         """The garment of a style on a person, with everything computed once that frames share.
@@ -107,6 +108,8 @@ class StyledGarment:
         Raises:
             InputError: style or shape are outside what was learned.
         """
+        if style is not None and not isinstance(style, Mapping):
+            style = self.ranges.named(style)
         unknown = [name for name in style or {} if name not in self.ranges.style]
         if unknown:
             raise InputError(f"style: expected {', '.join(self.ranges.style)}, found '{unknown[0]}'")
@@ -134,6 +137,7 @@ class WornGarment:
         self._under = person_under(garment.garment, garment.body, np.asarray(person.shape, np.float32))
         self._canonical = garment.canonical(numbers)
         self._contact: tuple[IntersectionRemoval, WornBody] | None = None
+        self._near: BodyCandidates | None = None
 
     @property
     def in_a_pose(self) -> Float64[np.ndarray, "verts 3"]:
@@ -171,6 +175,21 @@ class WornGarment:
         body = with_pose(self.person, rotations, translation)
         removal, worn = self._contacts()
         return removal(self._placed(body), worn.posed(body.vertices()))
+
+    def live(
+        self, rotations: Float[np.ndarray, "joints 3 3"], translation: Float[np.ndarray, "3"]
+    ) -> Float64[np.ndarray, "verts 3"]:
+        """The garment in a pose, metres, as fast as a picture is drawn: pushed out of the limbs that carry it, which
+        leaves a few tenths of a percent inside, where `outside` leaves nothing and takes fifty times as long."""
+        if self._near is None:
+            garment, config = self._garment.garment, self._config
+            assert garment.skin_weights is not None
+            self._near = BodyCandidates(
+                self.person, self.in_a_pose, self.faces, garment.skin_weights,
+                longest=config.longest or np.inf, margin_m=1e-3 * config.removal.margin_mm,
+            )  # fmt: skip
+        body = with_pose(self.person, rotations, translation)
+        return self._near.pushed_out(self._near.skinned(self.unposed(np.asarray(rotations)[None])[0], body), body)
 
     def _placed(self, body: PosedBody) -> Float64[np.ndarray, "verts 3"]:
         weights = self._garment.garment.skin_weights

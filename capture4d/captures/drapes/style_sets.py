@@ -44,7 +44,7 @@ class Ranges:
     """Which numbers vary, and from where to where: a pair of style and shape as numbers from -1 to 1."""
 
     style: Mapping[str, tuple[float, float]]
-    """Least and most of each number of the pattern that varies, by name."""
+    """Least and most of each number of the style, by name: one of the pattern that varies, or a component."""
     shape: Sequence[tuple[float, float]]
     """Least and most of each shape component, up to the last that varies; those between may be fixed."""
 
@@ -79,6 +79,29 @@ class Ranges:
                 found.append(place)
         return np.array(found)
 
+    def named(self, values: Sequence[float]) -> dict[str, float]:
+        """Style numbers by name, of values in the order of the ranges; the last may be left out.
+
+        Raises:
+            InputError: there are more values than names.
+        """
+        if len(values) > len(self.style):
+            raise InputError(f"style: expected at most {len(self.style)} numbers, {', '.join(self.style)}; "
+                             f"found {len(values)}")  # fmt: skip
+        return dict(zip(self.style, map(float, values), strict=False))
+
+    def values(self, numbers: Float[np.ndarray, " numbers"]) -> tuple[dict[str, float], tuple[float, ...]]:
+        """Style, by name, and shape that a vector of `numbers` tells: what `numbers` was made from."""
+        places = [float(each) for each in numbers]
+        style = {
+            name: (low + high) / 2 + place * (high - low) / 2
+            for (name, (low, high)), place in zip(self.style.items(), places, strict=False)
+        }
+        rest = iter(places[len(style) :])
+        shape = tuple((low + high) / 2 + (next(rest) if low < high else 0.0) * (high - low) / 2
+                      for low, high in self.shape)  # fmt: skip
+        return style, shape
+
 
 def _place(value: float, low: float, high: float, name: str) -> float:
     half = (high - low) / 2
@@ -98,6 +121,8 @@ class StylePair:
     drapes: DrapeSet
     canonical: Float32[np.ndarray, "verts 3"]
     """At rest in the A-pose, which is the body's rest pose, metres."""
+    style: Mapping[str, float]
+    """Numbers of the style, by the names of the ranges: those of the pattern that vary, or components."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,7 +130,7 @@ class CanonicalDrapes:
     """Pairs at rest in the A-pose."""
 
     styles: Float64[np.ndarray, "tried styles"]
-    """Numbers of the pattern that vary, in the order of the ranges."""
+    """Numbers of the style, in the order of the ranges."""
     shapes: Float64[np.ndarray, "tried shapes"]
     vertices: Float32[np.ndarray, "tried verts 3"]
     """Metres."""
@@ -156,7 +181,8 @@ def read_style_set(folder: Path) -> StyleSet:
         if row >= len(canonical.vertices):
             raise InputError(f"pairs: expected one of {len(canonical.vertices)} A-poses, found {row}", where=path)
         drapes = read_drapes(folder / "pairs" / name)
-        pairs.append(StylePair(name, role, drapes, canonical.vertices[row]))
+        style = dict(zip(ranges.style, canonical.styles[row].tolist(), strict=True))
+        pairs.append(StylePair(name, role, drapes, canonical.vertices[row], style))
     _require_one_garment(folder, pairs)
     return StyleSet(ranges, pairs, canonical, unseen, record["digest"])
 

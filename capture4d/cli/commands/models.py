@@ -1,4 +1,4 @@
-"""`capture4d fit`, `animate` and `fit-styles`: the garment as a model."""
+"""`capture4d fit`, `animate`, `fit-styles` and `fit-style`: the garment as a model."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from capture4d.cli.exit_codes import GOOD
+from capture4d.cli.commands.files import FileOptions
+from capture4d.cli.exit_codes import BAD_RESULT, GOOD
 from capture4d.cli.options import GradedOptions, MeshOptions, StageOptions
 from capture4d.cli.verdict import say_verdict
 from capture4d.errors import CommandLineError, InputError
@@ -18,7 +19,7 @@ from capture4d.settings import Number
 from retarget.config import AnimateConfig, FitConfig
 from retarget.mixture import config as mixture_config
 
-__all__ = ["Animate", "Fit", "FitStyles"]
+__all__ = ["Animate", "Fit", "FitStyle", "FitStyles"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +68,8 @@ class Animate(GradedOptions):
     beta: tuple[Number, ...] | None = None
     """Shape of the person, in standard deviations; the captured person without --body and --beta."""
     styles: Annotated[tuple[str, ...], arg(name="style")] = ()
-    """Numbers of the pattern, NAME=VALUE each, for a garment with styles; in the middle of their range without."""
+    """Style of a garment with styles: NAME=VALUE each; or numbers in their order, such as 0.5,-1; or @style.json, which
+    `fit-style` wrote. What is left out is in the middle of its range."""
     device: str = "cpu"
     """Where torch computes, such as cpu or cuda."""
     config: Annotated[AnimateConfig, arg(name="")] = field(default_factory=AnimateConfig)
@@ -82,7 +84,7 @@ class Animate(GradedOptions):
             self.poses,
             self.output,
             self.config,
-            wearer=Wearer(self.body, self.beta, _numbers(self.styles) if self.styles else None),
+            wearer=Wearer(self.body, self.beta, _style(self.styles)),
             device=self.device,
             workers=self.workers,
             overwrite=self.overwrite,
@@ -96,18 +98,47 @@ class Animate(GradedOptions):
         return self.graded(result)
 
 
-def _numbers(texts: tuple[str, ...]) -> dict[str, float]:
-    """NAME=VALUE texts as numbers by name."""
+def _style(texts: tuple[str, ...]) -> dict[str, float] | tuple[float, ...] | None:
+    """A style as it was given: numbers by name, numbers in their order, or what a style.json says; None without."""
+    if not texts:
+        return None
+    first, *others = texts
+    if first.startswith("@"):
+        if others:
+            raise InputError(f"--style: expected one file, or numbers, found {others[0]!r} after {first!r}")
+        return _style_of_file(Path(first[1:]))
+    if not any("=" in text for text in texts):
+        return tuple(_finite(part, texts) for text in texts for part in text.split(","))
     found = {}
     for text in texts:
         name, sign, value = text.partition("=")
-        try:
-            found[name] = float(value)
-        except ValueError:
-            sign = ""
-        if not sign or not math.isfinite(found[name]):
-            raise InputError(f"--style: expected NAME=VALUE, a number, found {text!r}")
+        if not sign:
+            raise InputError(f"--style: expected NAME=VALUE, found {text!r}")
+        found[name] = _finite(value, texts)
     return found
+
+
+def _finite(text: str, texts: tuple[str, ...]) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise InputError(f"--style: expected NAME=VALUE, numbers or @FILE, found {' '.join(texts)!r}")
+    return value
+
+
+def _style_of_file(path: Path) -> dict[str, float]:
+    from capture4d.files.atomic import read_json
+    from capture4d.files.json_values import entry, number
+    from capture4d.files.reading import reading
+
+    about = read_json(path)
+    with reading(path, "style"):
+        style = entry(about, "style")
+        if not isinstance(style, dict):
+            raise InputError("style: expected an object of numbers by name, found something else")
+        return {name: number(value, f"style.{name}") for name, value in style.items()}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,3 +164,30 @@ class FitStyles(StageOptions):
             print(f"{part}: {errors['vertex_mm']:.1f} mm, {errors['normal_deg']:.1f} deg, {errors['drapes']} drapes")
         print(f"model: {result.path}")
         return GOOD
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitStyle(FileOptions):
+    """Find the style and the person of a registered or scanned garment, with a garment with styles as model."""
+
+    model: Annotated[Positional[Path], arg(metavar="MODEL")]
+    """The folder that `fit-styles` wrote."""
+    work: Annotated[Positional[Path], arg(metavar="WORK")]
+    """Work folder of a take that was registered, or extracted and tracked, on the model's body."""
+    output: Path
+    """style.json to write, for `animate --style @style.json`."""
+    config: Annotated[mixture_config.StyleFitConfig, arg(name="")] = field(
+        default_factory=mixture_config.StyleFitConfig
+    )
+
+    def __call__(self) -> int:
+        from capture4d import pipeline
+
+        found = pipeline.fit_style(self.model, self.work, self.output, self.config, overwrite=self.overwrite)
+        fit = found.fit
+        print(f"style: {', '.join(f'{name} {value:.3f}' for name, value in fit.style.items())}")
+        print(f"beta: {' '.join(f'{value:.2f}' for value in fit.beta)}")
+        print(f"residual: {fit.residual_mm.mean():.1f} mm in {len(found.frame_ids)} frames: {found.path}")
+        for reason in found.reasons:
+            print(f"capture4d: to be checked: {reason}", file=sys.stderr)
+        return BAD_RESULT if found.reasons else GOOD

@@ -60,8 +60,12 @@ def test_an_animation_is_what_the_garment_says(styled: Path, tmp_path: Path):
 @pytest.mark.parametrize(
     ("more", "said"),
     [
-        (["--style", "length"], "--style: expected NAME=VALUE, a number, found 'length'"),
-        (["--style", "length=long"], "--style: expected NAME=VALUE, a number, found 'length=long'"),
+        (["--style", "length"], "--style: expected NAME=VALUE, numbers or @FILE, found 'length'"),
+        (["--style", "length=long"], "--style: expected NAME=VALUE, numbers or @FILE, found 'length=long'"),
+        (["--style", "length=0.5", "wide"], "--style: expected NAME=VALUE, found 'wide'"),
+        (["--style", "0.5,0.7"], "style: expected at most 1 numbers, length; found 2"),
+        (["--style", "@none.json", "length=1"], "--style: expected one file, or numbers"),
+        (["--style", "@none.json"], "none.json"),
         (["--style", "width=1"], "style: expected length, found 'width'"),
         (["--style", "length=3"], "style length: expected 0.4 to 0.8"),
         (["--beta", "4"], "beta 1: expected -1 to 1"),

@@ -93,7 +93,8 @@ def _pair(name: str, style: float, shape: float, garment: Garment, body: Body, a
         np.arange(1, len(angles) + 1, dtype=np.int32), rotations, np.array(vertices, np.float32),
         np.ones(len(angles), bool),
     )  # fmt: skip
-    return StylePair(name, "test" if name.startswith("test") else "prototype", drapes, at_rest.astype(np.float32))
+    role = "test" if name.startswith("test") else "prototype"
+    return StylePair(name, role, drapes, at_rest.astype(np.float32), {"length": style})
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,154 @@
+"""What stands around a garment with styles: prototypes of its pool, live frames, and styles found again.
+
+A number of style or shape counts in sigma: of a shape that is its unit, of a style two thirds of half its range, as
+ranges are 1.5 sigma either way.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from benchmarks.metric import Metric
+from capture4d.body.limbs import WornBody
+from capture4d.body.skinning import with_pose
+from capture4d.captures.drapes.style_sets import Ranges
+from capture4d.geometry.intersection_removal import Penetration
+from capture4d.learning.convex_fits import furthest_first
+from capture4d.types import Mesh
+from retarget.mixture.lesson import PairDrapes, StyleLesson
+from retarget.mixture.style_fit import SeenFrame, fit_style
+from retarget.mixture.styled_garment import StyledGarment
+
+__all__ = ["fit_metrics", "frame_metrics", "prototype_metrics"]
+
+STYLE_SIGMAS = 1.5
+NOISE_M, MISSING = 0.001, 0.25
+"""Of what stands for a scan: noise of each point, and the share of faces that nobody saw, in patches."""
+STILL = np.zeros(3)
+PROTOTYPES, DRAWS = 12, 5
+"""At most, or half of a small pool; random choices to beat."""
+
+
+def frame_metrics(garment: StyledGarment, lesson: StyleLesson, *, frames: int = 8) -> list[Metric]:
+    """Milliseconds of a frame from pose, shape and style, live and exact, on one core; and what is left inside."""
+    live, exact, left = [], [], []
+    for pair in _test_pairs(lesson)[:2]:
+        style, beta = garment.ranges.values(pair.numbers)
+        worn = garment.worn(beta, style)
+        weights = garment.garment.skin_weights
+        assert weights is not None
+        body = WornBody(worn.person, worn.in_a_pose, weights)
+        rows = np.flatnonzero(pair.unseen)[:frames]
+        worn.live(pair.rotations[rows[0]], STILL)  # compiles
+        for row in rows:
+            rotations = pair.rotations[row].astype(np.float64)
+            begun = time.process_time()
+            vertices = worn.live(rotations, STILL)
+            live.append(time.process_time() - begun)
+            begun = time.process_time()
+            worn.outside(rotations, STILL)
+            exact.append(time.process_time() - begun)
+            surface = body.posed(with_pose(worn.person, rotations, STILL).vertices())
+            left.append(Penetration.of(surface.contacts(vertices)).inside_percent)
+    return [
+        Metric("frame_ms", 1e3 * float(np.median(live)), "ms"),
+        Metric("frame_exact_ms", 1e3 * float(np.median(exact)), "ms"),
+        Metric("frame_inside_percent", float(np.mean(left)), "%"),
+    ]
+
+
+@dataclass(slots=True)
+class _Errors:
+    registered: list[np.ndarray]
+    scanned: list[np.ndarray]
+    seconds: list[float]
+
+
+def fit_metrics(garment: StyledGarment, lesson: StyleLesson, *, frames: int = 3) -> list[Metric]:
+    """Mean error of a component, in sigma, from one registered frame and from one scan of an unseen pair."""
+    found = _Errors([], [], [])
+    scale = _sigmas(garment.ranges)
+    for index, pair in enumerate(_test_pairs(lesson)):
+        rng = np.random.default_rng([17, index])
+        for row in np.flatnonzero(pair.unseen)[:frames]:
+            vertices = pair.posed(pair.unposed[[row]], lesson.skin_weights)[0]
+            seen = _seen(garment, pair, int(row), vertices)
+            begun = time.process_time()
+            fit = fit_style(garment, [seen])
+            found.seconds.append(time.process_time() - begun)
+            found.registered.append(scale * np.abs(fit.numbers - pair.numbers))
+            scan = _scanned(garment, seen, rng)
+            found.scanned.append(scale * np.abs(fit_style(garment, [scan]).numbers - pair.numbers))
+    return [
+        Metric("fit_style_registered_sigma", _mean(found.registered)),
+        Metric("fit_style_scan_sigma", _mean(found.scanned)),
+        Metric("fit_style_s", float(np.mean(found.seconds)), "s"),
+    ]
+
+
+def prototype_metrics(lesson: StyleLesson) -> list[Metric]:
+    """Mean vertex error, in the A-pose, of convex combinations of prototypes: chosen as the set chooses them, beginning
+    with one style on everybody as in the paper, and at random."""
+    pool, styles = lesson.pool, len(lesson.ranges.style)
+    count = min(PROTOTYPES, len(pool) // 2)
+    middle = np.linalg.norm(lesson.pool_numbers[:, :styles], axis=1)
+    everybody = np.flatnonzero(middle < middle.min() + 1e-9)[:count]
+    central = int(np.argmin(np.linalg.norm(lesson.pool_numbers, axis=1)))
+    rows, rng = pool.reshape(len(pool), -1), np.random.default_rng(5)
+
+    def mean_mm(start: np.ndarray) -> float:
+        return 1e3 * furthest_first(rows, [int(each) for each in start], count, _apart)[1][-1][1]
+
+    drawn = [mean_mm(rng.choice(len(pool), count, replace=False)) for _ in range(DRAWS)]
+    return [
+        Metric("prototypes", count, "", "higher"),
+        Metric("convex_fit_mm", mean_mm(np.array([central])), "mm"),
+        Metric("convex_fit_paper_mm", mean_mm(everybody), "mm"),
+        Metric("convex_fit_random_mm", float(np.mean(drawn)), "mm"),
+    ]
+
+
+def _apart(one: np.ndarray, other: np.ndarray) -> float:
+    return float(np.linalg.norm((one - other).reshape(-1, 3), axis=1).mean())
+
+
+def _test_pairs(lesson: StyleLesson) -> list[PairDrapes]:
+    return [pair for pair in lesson.pairs if pair.test and pair.unseen.any()]
+
+
+def _sigmas(ranges: Ranges) -> np.ndarray:
+    """Of each number, from -1 to 1, how many sigma a unit is."""
+    shapes = [(high - low) / 2 for low, high in ranges.shape if low < high]
+    return np.array([STYLE_SIGMAS] * len(ranges.style) + shapes)
+
+
+def _seen(garment: StyledGarment, pair: PairDrapes, row: int, vertices: np.ndarray) -> SeenFrame:
+    loops = garment.garment.loops
+    points = np.concatenate([np.zeros((0, 3)), *(vertices[loop] for loop in loops.values())])
+    return SeenFrame(
+        pair.rotations[row], STILL, Mesh(vertices.astype(np.float32), garment.garment.template.faces), True,
+        points.astype(np.float32), tuple(name for name, loop in loops.items() for _ in loop),
+    )  # fmt: skip
+
+
+def _scanned(garment: StyledGarment, seen: SeenFrame, rng: np.random.Generator) -> SeenFrame:
+    """The same with other vertices, noise, and patches that nobody saw."""
+    mesh = seen.mesh
+    middles = mesh.vertices[mesh.faces].mean(axis=1)
+    centres = middles[rng.choice(len(middles), 6, replace=False)]
+    near = np.linalg.norm(middles[:, None] - centres, axis=2).min(axis=1)
+    faces = mesh.faces[near > np.quantile(near, MISSING)]
+    points = mesh.vertices + NOISE_M * rng.standard_normal(mesh.vertices.shape)
+    border = seen.border_points + NOISE_M * rng.standard_normal(seen.border_points.shape)
+    return SeenFrame(
+        seen.rotations, seen.translation, Mesh(points.astype(np.float32), faces), False, border.astype(np.float32),
+        seen.border_names,
+    )  # fmt: skip
+
+
+def _mean(errors: Sequence[np.ndarray]) -> float:
+    return float(np.mean(errors))
