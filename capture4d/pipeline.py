@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from capture4d.app.compare.config import CompareConfig
-from capture4d.app.export.export import export
+from capture4d.app.export.export import export, texture
 from capture4d.app.importing.folders import import_meshes, score
 from capture4d.app.status.work_folders import changes, diff, made_anew, needs_tracking, status
 from capture4d.app.status.work_folders import plan as plan
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 __all__ = [
     "animate", "calibrate", "check", "check_rig", "compare", "diff", "export", "extract", "fit", "fit_styles",
     "import_meshes", "offsets_predict", "offsets_train", "register", "register_mesh", "report", "run", "scan", "score",
-    "status", "synth", "synth_board", "synth_drapes", "template", "track",
+    "status", "synth", "synth_board", "synth_drapes", "template", "texture", "track",
     "wrinkles_apply", "wrinkles_maps", "wrinkles_offsets", "wrinkles_train",
 ]  # fmt: skip
 

@@ -34,6 +34,9 @@ class ExportConfig:
 
     maps: Literal["8", "16", "none"] = "8"
     """Bits of the normal maps of WORK/wrinkles/generated that go along, if there are any."""
+    albedo: str | None = None
+    """Picture of the cloth's colours over the template's UVs, as `texture` makes one; if absent, that of WORK/texture,
+    if there is one; `none` leaves it out."""
     normals: bool = True
     """Author each frame's vertex normals in USD and Alembic: every client shades alike, Blender shows a frame in three
     times the time."""

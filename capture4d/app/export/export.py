@@ -1,4 +1,4 @@
-"""What `capture4d export` does, for Python: the pipeline hands it on."""
+"""What `capture4d texture` and `export` do, for Python: the pipeline hands them on."""
 
 from __future__ import annotations
 
@@ -9,11 +9,23 @@ from typing import TYPE_CHECKING
 from capture4d.app.export.config import ExportConfig, Format
 from capture4d.captures.work_folder import AnyWork, Place, opened_work
 from capture4d.runs.run_log import logged_stage
+from capture4d.runs.stage import StageResult
+from capture4d.texturing.config import TextureConfig
 
 if TYPE_CHECKING:
     from capture4d.app.export.stage import Exported
 
-__all__ = ["export"]
+__all__ = ["export", "texture"]
+
+
+@logged_stage("texture")
+def texture(
+    work: AnyWork, config: TextureConfig | None = None, *, workers: int = 1, overwrite: bool = False
+) -> StageResult:
+    """Bake the colours of a registered take's scans to its template's UVs, without the light on them: WORK/texture."""
+    from capture4d.texturing.stage import run as stage
+
+    return stage(opened_work(work), config or TextureConfig(), workers=workers, overwrite=overwrite)
 
 
 @logged_stage("export")

@@ -4,6 +4,7 @@ stage.json            what was made, and from what
 export.json           of each file, how large its error is; frames and rate
 garment.usdc ...      a file for each format; obj/000123.obj and ply/000123.ply
 normals/000123.png    normal maps, if there are any
+albedo.png            the cloth's colours, if they are known; garment.mtl names it
 open_in_blender.py    opens it with rate, range, material and maps
 
 A format is what a frame is to other stages: what is there is not made again, and one more can be added.
@@ -21,11 +22,12 @@ from typing import Any
 
 import numpy as np
 
+from capture4d.app.export.albedo import write_albedo
 from capture4d.app.export.clip import Clip, read_clip
 from capture4d.app.export.config import ExportConfig, Format
 from capture4d.app.export.correctives import FitError
 from capture4d.app.export.maps import map_name, write_maps
-from capture4d.app.export.writers import Written, file_of, write_format, write_sequence
+from capture4d.app.export.writers import ALBEDO_FILE, MATERIAL, Written, file_of, write_format, write_sequence
 from capture4d.captures.work_folder import WorkFolder
 from capture4d.errors import InputError
 from capture4d.files.atomic import TEMPORARY_SUFFIX, read_json, write_bytes, write_json
@@ -84,9 +86,10 @@ def run(
         InputError: nothing is registered, a format cannot hold these frames, or its package is not installed.
     """
     digest = work.registered_digest
-    clip = read_clip(work, frames, with_maps=config.maps != "none")
+    clip = read_clip(work, frames, with_maps=config.maps != "none", albedo=config.albedo)
     ids = clip.moving.frame_ids.tolist()
     upstream = {"registration": digest} | ({} if clip.maps is None else {"maps": clip.maps.digest})
+    upstream |= {} if clip.albedo is None else {"albedo": clip.albedo.digest}
     stage = open_stage(
         output, name="export", schema=SCHEMA, config={"export": config, "frames": listed(ids, 0)},
         upstream=upstream, sources={"work": work.path}, overwrite=overwrite,
@@ -99,6 +102,8 @@ def run(
         if clip.maps is not None:
             write_maps(stage.path, clip.maps, ids, int(config.maps))
             advance(1)
+        if clip.albedo is not None and not (stage.path / ALBEDO_FILE).is_file():
+            write_albedo(stage.path / ALBEDO_FILE, clip.albedo, clip.moving.mesh)
         for kind in formats:
             known = _known(stage, record, kind)
             each = known or _write(kind, stage, clip, config)
@@ -135,8 +140,9 @@ def _write(kind: Format, stage: Stage, clip: Clip, config: ExportConfig) -> Writ
     if file_of(kind) is None:
         return write_sequence(kind, stage.path, clip)
     with new_files_in(stage.path, overwrite=True) as workshop:
-        if clip.maps is not None:
-            (workshop / "normals").symlink_to(stage.path.resolve() / "normals")  # as it will lie beside the file
+        for beside in ("normals", ALBEDO_FILE, MATERIAL):  # as they will lie beside the file
+            if (stage.path / beside).exists():
+                (workshop / beside).symlink_to(stage.path.resolve() / beside)
         try:
             return write_format(kind, workshop, clip, config)
         except InputError as error:
@@ -157,6 +163,7 @@ def _write_script(stage: Stage, clip: Clip, record: dict[str, Any]) -> None:
         "last": int(ids[-1]),
         "step": int(steps[0]) if len(steps) else 1,
         "maps": Path(map_name(int(ids[0]))).name if clip.maps is not None else None,
+        "albedo": ALBEDO_FILE if clip.albedo is not None else "",
     }
     text = files("capture4d.app.export").joinpath("open_in_blender.txt").read_text(encoding="utf-8")
     said = json.dumps(take).replace("null", "None")

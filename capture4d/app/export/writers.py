@@ -23,8 +23,9 @@ from capture4d.mesh_files.animated.usd import read_usd, usd_faults, write_usd
 from capture4d.mesh_files.gltf.animated_scene import AnimatedScene, write_animated_glb
 from capture4d.mesh_files.meshes import read_mesh, write_mesh
 from capture4d.mesh_files.obj import obj_bytes
+from capture4d.types import Mesh
 
-__all__ = ["BASE", "Written", "file_of", "write_format", "write_sequence"]
+__all__ = ["ALBEDO_FILE", "BASE", "MATERIAL", "Written", "file_of", "write_format", "write_sequence"]
 
 BASE = "garment.obj"
 """The mesh that point caches belong to."""
@@ -32,8 +33,11 @@ _FILES: Mapping[Format, str] = {
     "usd": "garment.usdc", "abc": "garment.abc", "glb": "garment.glb", "pc2": "garment.pc2", "mdd": "garment.mdd",
     "html": "garment.html",
 }  # fmt: skip
+ALBEDO_FILE, MATERIAL = "albedo.png", "garment.mtl"
+"""The cloth's colours, and what tells of them beside an OBJ."""
 _SMOOTH = b"s 1\n"
 """One smoothing group: without it Blender shades an OBJ flat."""
+_MATERIAL = f"newmtl garment\nKd 1 1 1\nKs 0 0 0\nmap_Kd {ALBEDO_FILE}\n".encode()
 EXACT_MM = 0.001
 """What a format that keeps positions as they are may lose."""
 _GLB_AGREES_MM = 0.002
@@ -71,7 +75,8 @@ def write_format(kind: Format, folder: Path, clip: Clip, config: ExportConfig) -
     match kind:
         case "usd":
             maps = [f"./{map_name(frame_id)}" for frame_id in moving.frame_ids.tolist()] if clip.maps else []
-            write_usd(path, moving, maps=maps, normals=config.normals)
+            albedo = f"./{ALBEDO_FILE}" if clip.albedo else None
+            write_usd(path, moving, maps=maps, albedo=albedo, normals=config.normals)
             _require_no_faults(path, usd_faults(path))
             found = read_usd(path)
         case "abc":
@@ -91,7 +96,7 @@ def write_format(kind: Format, folder: Path, clip: Clip, config: ExportConfig) -
         case _:
             raise AssertionError(f"{kind} has a file for each frame")
     if kind in ("pc2", "mdd"):
-        write_bytes(folder / BASE, _SMOOTH + obj_bytes(moving.mesh, None, None))
+        _write_obj(folder / BASE, moving.mesh, folder if clip.albedo else None)
         base = read_mesh(folder / BASE).mesh
         _require_close(folder / BASE, 1000 * float(np.abs(base.vertices - moving.mesh.vertices).max()), EXACT_MM)
     error = 1000 * largest_difference(moving, found)
@@ -107,7 +112,7 @@ def write_sequence(kind: Format, folder: Path, clip: Clip) -> Written:
         mesh = clip.moving.mesh.with_vertices(vertices)
         if not path.is_file():
             if kind == "obj":
-                write_bytes(path, _SMOOTH + obj_bytes(mesh, None, None))
+                _write_obj(path, mesh, path.parent if clip.albedo else None)
             else:
                 write_mesh(path, mesh)
         found = read_mesh(path).mesh
@@ -116,6 +121,18 @@ def write_sequence(kind: Format, folder: Path, clip: Clip) -> Written:
         largest = max(largest, 1000 * float(np.linalg.norm(found.vertices - mesh.vertices, axis=1).max()))
         _require_close(path, largest, EXACT_MM)
     return Written(f"{kind}/", largest)
+
+
+def _write_obj(path: Path, mesh: Mesh, coloured: Path | None) -> None:
+    """Args: coloured: the folder that gets the material, where there are colours."""
+    head = _SMOOTH
+    if coloured is not None:
+        material = coloured / MATERIAL
+        if not material.is_file():
+            beside = (coloured / ALBEDO_FILE).exists()
+            write_bytes(material, _MATERIAL if beside else _MATERIAL.replace(b"map_Kd ", b"map_Kd ../"))
+        head = f"mtllib {MATERIAL}\nusemtl garment\n".encode() + head
+    write_bytes(path, head + obj_bytes(mesh, None, None))
 
 
 def _write_glb(path: Path, clip: Clip, config: ExportConfig) -> Written:
@@ -134,7 +151,9 @@ def _write_glb(path: Path, clip: Clip, config: ExportConfig) -> Written:
     times = (moving.times_s() - moving.times_s()[0]).astype(np.float32)
     skin = None if skeleton is None else skeleton.scene_skin()
     clock = {"fps": moving.fps, "first_frame": first}
-    write_animated_glb(path, AnimatedScene(moving.mesh, times, targets, skin, still, {"capture4d": told}, clock))
+    colours = None if clip.albedo is None else (path.parent / ALBEDO_FILE).read_bytes()
+    scene = AnimatedScene(moving.mesh, times, targets, skin, still, colours, {"capture4d": told}, clock)
+    write_animated_glb(path, scene)
     found = 1000 * largest_glb_difference(path, moving)
     _require_close(path, found, error.max_mm + _GLB_AGREES_MM)
     at_99, at_most = (glb.p99_mm, glb.max_mm) if glb.motion == "skinned" else (EXACT_MM, EXACT_MM)

@@ -1,4 +1,4 @@
-"""`capture4d export`, `import` and `score`: a garment out to other tools, and back."""
+"""`capture4d texture`, `export`, `import` and `score`: a garment out to other tools, and back."""
 
 from __future__ import annotations
 
@@ -14,11 +14,35 @@ from capture4d.app.importing.config import ImportConfig
 from capture4d.cli.exit_codes import BAD_RESULT, GOOD
 from capture4d.cli.options import MeshOptions, ProgressOptions, StageOptions
 from capture4d.errors import CommandLineError
+from capture4d.texturing.config import TextureConfig
 
 if TYPE_CHECKING:
     from capture4d.app.export.correctives import FitError
 
-__all__ = ["Export", "Import", "Score"]
+__all__ = ["Export", "Import", "Score", "Texture"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Texture(StageOptions):
+    """Bake the colours of a take's scans to the template's UVs: one picture, without the light that fell on them."""
+
+    work: Annotated[Positional[Path], arg(metavar="WORK")]
+    """Work folder of a registered take; gets texture/."""
+    config: Annotated[TextureConfig, arg(name="")] = field(default_factory=TextureConfig)
+
+    def __call__(self) -> int:
+        from capture4d import pipeline
+        from capture4d.files.atomic import read_json
+
+        result = pipeline.texture(self.work, self.config, workers=self.workers, overwrite=self.overwrite)
+        told = read_json(result.path / "texture.json")
+        dark, bright = told["light"]
+        print(
+            f"texture: {result.frames} frames, {100 * told['seen_share']:.1f} % of it seen, frames differ by "
+            f"{told['spread_levels']:.1f} levels, light from {dark:.2f} to {bright:.2f}"
+        )
+        print(f"albedo: {result.path / 'albedo.png'}")
+        return GOOD
 
 
 @dataclass(frozen=True, kw_only=True)
