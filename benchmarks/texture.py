@@ -1,7 +1,7 @@
 """Textures of printed takes against the prints that were on them.
 
     error_median_levels, error_p90_levels    sRGB levels of 255, largest channel, after one factor for it all:
-                                             how bright the light was cannot be known; texels a hand's width from paint
+                                             how bright the light was cannot be known; seen, 3 cm and more from paint
     unlit_error_median_levels                the same where the light was left in
     brightness                               that factor
     seam_ratio                               median error within 10 mm of a seam of the UVs over that elsewhere
@@ -108,7 +108,7 @@ def compared(work: Path, picture: Path, true: Path) -> _Found:
     raster = rasterise_uv(mesh, len(pixels), padding=0)
     places = raster.at_vertices(mesh.vertices.astype(np.float64))
     borders = mesh.vertices[np.unique(boundary_edges(mesh.faces))]
-    looked = raster.inside.copy()
+    looked = raster.inside & (raster.read(read_picture(picture.with_name("seen.png"))).max(axis=1) > 0)
     if len(borders):
         looked &= KDTree(borders).query(places)[0] > PAINTED_M
     made = raster.read(pixels).astype(np.float64)[looked]

@@ -10,11 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from capture4d.geometry.mesh import boundary_edges, normalised, vertex_normals
+from capture4d.geometry.mesh_kernels import laplacian_pass
 from capture4d.geometry.ray_casting import TriangleScene, barycentric
 from capture4d.geometry.uv_raster import UvRaster
 from capture4d.types import GarmentScan
@@ -27,6 +29,8 @@ HALF_M = 0.5
 """Of the distance that is looked through: where an answer's weight has fallen to 1/e."""
 BESIDE_BORDER = 0.02
 """Weight next to a scan's open border."""
+SMOOTHED = 2
+"""How often normals of a scan are averaged with their neighbours': the noise of vertices goes, folds stay."""
 BLOCK = 1 << 18
 """Places that are looked up together: memory does not grow with the picture."""
 
@@ -54,7 +58,10 @@ class ColouredScan:
         assert scan.colours is not None
         mesh, self._colours, self._far = scan.mesh, scan.colours, distance_m
         self._faces, self._scene = mesh.faces, TriangleScene((mesh.vertices, mesh.faces))
-        self._normals = vertex_normals(mesh.vertices.astype(np.float64), mesh.faces)
+        normals: Any = vertex_normals(mesh.vertices.astype(np.float64), mesh.faces)
+        for _ in range(SMOOTHED):
+            normals = laplacian_pass(normals, mesh.faces, np.zeros(len(normals), bool))
+        self._normals = normalised(normals)
         self._trust = np.ones(len(mesh.vertices), np.float32)
         self._trust[boundary_edges(mesh.faces)] = BESIDE_BORDER
 

@@ -5,7 +5,9 @@ function of the world's directions for the whole take; here the spherical harmon
 itself. What is printed somewhere is there in every frame: it is an effect of the place, of unknown size, normally
 distributed over places, and frames are compared place by place; how far different places are compared as well follows
 from how much more they differ than the same place does (generalised least squares of a panel with random effects:
-Wooldridge, Econometric Analysis of Cross Section and Panel Data, 10.4). How bright the light is as a whole cannot be
+Wooldridge, Econometric Analysis of Cross Section and Panel Data, 10.4). Normals of scans are noisy, which would make
+the light look weaker than it is; those of the registered template, noisy in another way, are the instruments (ibid.,
+5.1). How bright the light is as a whole cannot be
 known: the mean over what was seen is 1.
 """
 
@@ -18,8 +20,8 @@ from jaxtyping import Float, Float32, Float64
 
 __all__ = ["Light", "fit_light"]
 
-DARKEST = 6.0
-"""Levels that are taken for the darkest: logarithms of less are noise."""
+DARKEST, BRIGHTEST = 6.0, 250.0
+"""Levels that are taken for the darkest: logarithms of less are noise; and from which on a camera may have clipped."""
 PATCH_M2 = 0.03**2
 """Colours of cloth are alike over so much of it: places in one patch are one place, as far as comparing goes."""
 ROUNDS = 4
@@ -56,6 +58,7 @@ def harmonics(normals: Float[np.ndarray, "*any 3"]) -> Float64[np.ndarray, "*any
 def fit_light(
     colours: Float32[np.ndarray, "frames places 3"],
     normals: Float32[np.ndarray, "frames places 3"],
+    smooth: Float32[np.ndarray, "frames places 3"],
     weights: Float32[np.ndarray, "frames places"],
     *,
     area_m2: float,
@@ -64,6 +67,8 @@ def fit_light(
 
     Args:
         colours: sRGB, 0 to 255, of the same places of the cloth in every frame.
+        normals: of the scans there.
+        smooth: of the registered template there.
         weights: 0 where nothing is seen.
         area_m2: of the cloth.
     Returns:
@@ -72,14 +77,16 @@ def fit_light(
     frames, places = weights.shape
     terms = harmonics(normals)
     shown = np.broadcast_to(np.eye(frames)[:, None, :], (frames, places, frames))
-    rows = np.concatenate([np.ones((frames, places, 1)), terms, shown], axis=2)
+    ones = np.ones((frames, places, 1))
+    rows = np.concatenate([ones, terms, shown], axis=2)
+    instruments = np.concatenate([ones, harmonics(smooth), shown], axis=2)
     alike = max(1.0, places * PATCH_M2 / max(area_m2, 1e-9))
     found, gains, mean = np.zeros((terms.shape[-1], 3)), np.zeros((frames, 3)), np.zeros(3)
     for channel in range(3):
         values = np.maximum(colours[..., channel].astype(np.float64), DARKEST)
         # A level is the larger part of a logarithm the darker it is.
-        precision = weights * (values / 255) ** 2
-        solution = _random_effects(rows, np.log(values), precision, alike)
+        precision = np.where(values < BRIGHTEST, weights, 0) * (values / 255) ** 2
+        solution = _random_effects(rows, instruments, np.log(values), precision, alike)
         found[:, channel] = solution[1 : 1 + terms.shape[-1]]
         gains[:, channel] = solution[1 + terms.shape[-1] :]
         total = precision.sum()
@@ -89,6 +96,7 @@ def fit_light(
 
 def _random_effects(
     rows: Float64[np.ndarray, "frames places columns"],
+    instruments: Float64[np.ndarray, "frames places columns"],
     values: Float64[np.ndarray, "frames places"],
     precision: Float64[np.ndarray, "frames places"],
     alike: float,
@@ -108,10 +116,10 @@ def _random_effects(
     for _ in range(ROUNDS):
         sums = weight.sum(axis=0)
         keep = added * alike / (error + added * alike * np.maximum(sums, 1e-12))
-        by_place = np.einsum("tp,tpc->pc", weight, rows)
-        heavy = (rows * weight[..., None]).reshape(-1, rows.shape[-1])
-        matrix = heavy.T @ rows.reshape(heavy.shape) - (by_place * keep[:, None]).T @ by_place
-        right = heavy.T @ values.reshape(-1) - by_place.T @ (keep * (weight * values).sum(axis=0))
+        by_place, told = (np.einsum("tp,tpc->pc", weight, each) for each in (rows, instruments))
+        heavy = (instruments * weight[..., None]).reshape(-1, rows.shape[-1])
+        matrix = heavy.T @ rows.reshape(heavy.shape) - (told * keep[:, None]).T @ by_place
+        right = heavy.T @ values.reshape(-1) - told.T @ (keep * (weight * values).sum(axis=0))
         solution = np.linalg.solve(matrix + np.diag(ridge * error), right)
         residual = values - rows @ solution
         place = (weight * residual).sum(axis=0) / np.maximum(sums, 1e-12)

@@ -3,6 +3,7 @@
 stage.json     what was made, and from what
 light.npz      how bright the cloth was by the direction in which it faces
 albedo.png     sRGB over the template's UVs, as `--print` takes it
+seen.png       white where any frame has seen the cloth
 texture.json   how much of it was seen, and by how much frames differ
 
 The light is found first, on a small picture of all frames; then the colours of each frame are baked, without the light,
@@ -32,16 +33,16 @@ from capture4d.geometry.uv_raster import UvRaster, rasterise_uv
 from capture4d.runs.frame_lists import frame_file
 from capture4d.runs.stage import Stage, StageResult, open_stage, require_complete
 from capture4d.runs.workers import run_jobs, shared
-from capture4d.texturing.baking import ColouredScan, as_bytes, surface_blocks
+from capture4d.texturing.baking import BESIDE_BORDER, ColouredScan, as_bytes, surface_blocks
 from capture4d.texturing.blending import blend, fill_holes, spread_out
 from capture4d.texturing.config import TextureConfig
-from capture4d.texturing.light import Light, fit_light
+from capture4d.texturing.light import BRIGHTEST, Light, fit_light
 from capture4d.types import GarmentScan, Mesh
 
 __all__ = ["ALBEDO", "TEXTURE", "run"]
 
 SCHEMA = 1
-TEXTURE, ALBEDO = "texture", "albedo.png"
+TEXTURE, ALBEDO, SEEN = "texture", "albedo.png", "seen.png"
 LIGHT_TEXELS, LIGHT_PLACES = 192, 6000
 """Of the picture on which the light is found, and how many of its texels are looked at."""
 
@@ -166,12 +167,12 @@ class _Looking:
     raster: UvRaster
 
 
-def _look(looking: _Looking, frame_id: int) -> tuple[int, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Colours, normals and weights of a few places in a frame."""
+def _look(looking: _Looking, frame_id: int) -> tuple[int, tuple[np.ndarray, ...]]:
+    """Colours, normals of scan and template, and weights of a few places in a frame."""
     take, scan = looking.take, ColouredScan(looking.take.scan(frame_id), looking.take.config.distance_m)
     ((_, places, normals),) = surface_blocks(looking.raster, take.vertices(frame_id), take.mesh.faces)
     seen = scan.seen_from(places, normals)
-    return frame_id, (seen.colours, seen.normals, seen.weights)
+    return frame_id, (seen.colours, seen.normals, normals.astype(np.float32), seen.weights)
 
 
 # --- the frames, and the picture ---------------------------------------------------------------------------------
@@ -185,8 +186,10 @@ def _bake(baking: _Baking, frame_id: int) -> None:
     for block, places, normals in surface_blocks(raster, take.vertices(frame_id), take.mesh.faces):
         seen = scan.seen_from(places, normals)
         found[block, :3] = as_bytes(seen.colours / (baking.light.at(seen.normals) * gain))
+        clipped = (seen.colours >= BRIGHTEST).any(axis=1)
+        weights = as_bytes(255 * np.where(clipped, BESIDE_BORDER, 1) * seen.weights)
         # What was seen at all counts for something: there may be nothing else.
-        found[block, 3] = np.where(seen.weights > 0, np.maximum(as_bytes(255 * seen.weights), 1), 0)
+        found[block, 3] = np.where(seen.weights > 0, np.maximum(weights, 1), 0)
     write_npy(baking.stage.frame_path(frame_id, ".npy"), found)
 
 
@@ -200,6 +203,8 @@ def _put_together(take: _Take, stage: Stage, chosen: Sequence[int], light: Light
     fill_holes(colours, seen, raster.at_vertices(take.mesh.vertices.astype(np.float64)))
     picture = spread_out(raster.image(as_bytes(colours)), raster.image(np.ones(len(colours), bool)))
     write_bytes(stage.path / ALBEDO, cv2.imencode(".png", picture[..., ::-1])[1].tobytes())
+    mask = raster.image(255 * (seen & inside).astype(np.uint8))
+    write_bytes(stage.path / SEEN, cv2.imencode(".png", mask)[1].tobytes())
     told: dict[str, Any] = {
         "texels": take.config.texels,
         "frames": list(chosen),

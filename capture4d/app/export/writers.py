@@ -124,13 +124,13 @@ def write_sequence(kind: Format, folder: Path, clip: Clip) -> Written:
 
 
 def _write_obj(path: Path, mesh: Mesh, coloured: Path | None) -> None:
-    """Args: coloured: the folder that gets the material, where there are colours."""
+    """Args: coloured: the folder that gets the material, and the colours themselves if they lie above it."""
     head = _SMOOTH
     if coloured is not None:
-        material = coloured / MATERIAL
-        if not material.is_file():
-            beside = (coloured / ALBEDO_FILE).exists()
-            write_bytes(material, _MATERIAL if beside else _MATERIAL.replace(b"map_Kd ", b"map_Kd ../"))
+        if not (coloured / ALBEDO_FILE).exists():  # other tools look beside a file, as our reader does
+            write_bytes(coloured / ALBEDO_FILE, (coloured.parent / ALBEDO_FILE).read_bytes())
+        if not (coloured / MATERIAL).exists():
+            write_bytes(coloured / MATERIAL, _MATERIAL)
         head = f"mtllib {MATERIAL}\nusemtl garment\n".encode() + head
     write_bytes(path, head + obj_bytes(mesh, None, None))
 
