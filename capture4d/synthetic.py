@@ -6,6 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TypeAlias
 
+from capture4d.app.cards.sources import with_card
 from capture4d.errors import InputError
 from capture4d.runs.run_log import logged_stage
 from capture4d.runs.stage import StageResult
@@ -66,9 +67,8 @@ def offsets_train(
     from wrinkles.offset_images.train_stage import run as stage
 
     given = None if labels is None else Path(labels)
-    return stage(
-        Path(drapes), Path(output), config or DrapeOffsetsConfig(), labels=given, workers=workers, overwrite=overwrite
-    )
+    config = config or DrapeOffsetsConfig()
+    return with_card(stage(Path(drapes), Path(output), config, labels=given, workers=workers, overwrite=overwrite))
 
 
 @logged_stage("offsets predict")
@@ -165,4 +165,4 @@ def fit_styles(
     """
     from retarget.mixture.stage import run as stage
 
-    return stage(Path(styles), Path(output), config or StylesConfig(), workers=workers, overwrite=overwrite)
+    return with_card(stage(Path(styles), Path(output), config or StylesConfig(), workers=workers, overwrite=overwrite))

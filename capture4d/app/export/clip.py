@@ -54,6 +54,8 @@ class Clip:
     """Of the cloth's colours."""
     notes: Sequence[str]
     """What is worth telling, a sentence each."""
+    name: str = "garment"
+    """Of its files."""
 
 
 def read_clip(work: WorkFolder, frames: str = "", *, with_maps: bool = True, albedo: str | None = None) -> Clip:

@@ -17,7 +17,7 @@ class OnnxConfig:
     """Of a learned garment: `auto` is the one that did best on the frames that validated."""
     beta: tuple[Number, ...] = ()
     """Body shape of the wearer, as `animate` takes it; if absent, whom the garment was learned on."""
-    style: dict[str, Number] | None = None
-    """Of a garment with styles: numbers of the pattern by name; in the middle of their range if absent."""
+    style: tuple[str, ...] = ()
+    """Of a garment with styles: numbers of the pattern, NAME=VALUE each; in the middle of their range if absent."""
     probes: Annotated[int, Range(least=8, most=4096)] = 64
     """Frames or maps on which the file is compared with the model, and timed."""

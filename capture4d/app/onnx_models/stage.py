@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -188,8 +188,9 @@ def _garment(model: Path, config: OnnxConfig) -> _Task:
 
 def _styled(model: Path, config: OnnxConfig) -> _Task:
     known = load_styled_garment(model)
-    worn = known.worn(config.beta, config.style, AnimateConfig())
-    numbers = known.ranges.numbers(config.style or {}, config.beta)
+    style = _numbers(config.style)
+    worn = known.worn(config.beta, style, AnimateConfig())
+    numbers = known.ranges.numbers(style, config.beta)
     weights = known.garment.skin_weights
     assert weights is not None
     rng = np.random.default_rng(0)
@@ -204,7 +205,7 @@ def _styled(model: Path, config: OnnxConfig) -> _Task:
         "rotations": f"joints {', '.join(known.body.joint_names)}, against their parents",
         "transforms": "of the same joints, rest pose to world, metres",
         "vertices": "metres, world; not taken out of the body",
-        "style": json.dumps(config.style or {}),
+        "style": json.dumps(style),
         "beta": json.dumps([*config.beta]),
     }
     inputs = {"rotations": rotations, "transforms": transforms}
@@ -213,6 +214,18 @@ def _styled(model: Path, config: OnnxConfig) -> _Task:
     return _Task(
         "garment with styles", graph, inputs, "vertices", placed, placed, "torch", files, "none given", about
     )  # fmt: skip
+
+
+def _numbers(said: Sequence[str]) -> dict[str, float]:
+    """NAME=VALUE as numbers by name."""
+    found = {}
+    for word in said:
+        name, _, value = word.partition("=")
+        try:
+            found[name] = float(value)
+        except ValueError:
+            raise InputError(f"--style: expected NAME=VALUE, a number, found '{word}'") from None
+    return found
 
 
 # --- probes ------------------------------------------------------------------------------------------------------
