@@ -12,12 +12,14 @@ from pathlib import Path
 
 from capture4d.files.atomic import write_bytes, write_json
 
-__all__ = ["CARD", "PAGE", "UNKNOWN", "Card", "Figure", "Part", "write_card"]
+__all__ = ["CARD", "MIXED", "PAGE", "UNKNOWN", "Card", "Figure", "Part", "write_card"]
 
 FORMAT = 1
 CARD, PAGE = "card.json", "README.md"
 UNKNOWN = "not stated"
 """The licence of a part of which nobody has said one."""
+MIXED = "those of its parts"
+"""The licence of what was made from parts that have several."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +31,12 @@ class Part:
     place: str
     """Name of the file or folder, without the way to it; may be empty."""
     digest: str
-    licence: str
+    licences: Sequence[str]
+    """That it is under, all of them; `UNKNOWN` where something in it has none."""
+
+    @property
+    def licence(self) -> str:
+        return "; ".join(self.licences)
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,12 +68,12 @@ class Card:
     @property
     def notes(self) -> list[str]:
         """What has to be said of licences."""
-        found = {part.licence for part in self.parts} | {self.licence}
-        stated, said = sorted(found - {UNKNOWN}), []
+        found = {each for part in self.parts for each in part.licences} | {self.licence}
+        stated, said = sorted(found - {UNKNOWN, MIXED}), []
         if len(stated) > 1:
             each = "; ".join(stated)
             said.append(f"Parts are under different licences: {each}. Whoever hands this on has to keep all of them.")
-        silent = [part.name for part in self.parts if part.licence == UNKNOWN]
+        silent = [part.name for part in self.parts if UNKNOWN in part.licences]
         if self.licence == UNKNOWN:
             silent.insert(0, "the whole")
         if silent:

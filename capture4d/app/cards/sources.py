@@ -12,7 +12,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from capture4d.app.cards.card import CARD, UNKNOWN, Card, Figure, Part, write_card
+from capture4d.app.cards.card import CARD, MIXED, UNKNOWN, Card, Figure, Part, write_card
 from capture4d.errors import InputError
 from capture4d.files.atomic import read_json
 from capture4d.motions.sources import acknowledgement
@@ -39,8 +39,6 @@ COMMANDS: Mapping[str, str] = {
 }
 PACKAGES = ("capture4d", "numpy", "torch")
 NOT_GIVEN = ("", "none given")
-MIXED = "those of its parts"
-"""The licence of what was made from parts that have several."""
 DEPTH = 6
 """Folders that are followed back, one made from the next."""
 
@@ -82,7 +80,7 @@ def _licence(record: Mapping[str, Any], parts: list[Part]) -> str:
     said = config.get("licence") if isinstance(config, dict) else None
     if isinstance(said, str) and said not in NOT_GIVEN:
         return said
-    found = {part.licence for part in parts}
+    found = {each for part in parts for each in part.licences}
     if len(found) == 1:
         return found.pop()
     return UNKNOWN if not found or UNKNOWN in found else MIXED
@@ -95,29 +93,30 @@ def _parts(record: Mapping[str, Any]) -> Iterator[Part]:
     for name, digest in (record.get("upstream") or {}).items():
         given = sources.get(name)
         place = Path(given) if given is not None else only
-        yield Part(name, "" if place is None else place.name, str(digest), _licence_of(place, DEPTH))
+        yield Part(name, "" if place is None else place.name, str(digest), sorted(_licences_of(place, DEPTH)))
 
 
-def _licence_of(place: Path | None, depth: int) -> str:
+def _licences_of(place: Path | None, depth: int) -> set[str]:
     """What a folder, or a file, says of who may use it; followed back through what it was made from."""
     if place is None or depth == 0:
-        return UNKNOWN
+        return {UNKNOWN}
     if place.is_file():
-        return acknowledgement(place) or UNKNOWN
-    for name, key in ((CARD, "licence"), ("capture.json", "licence")):
-        if (place / name).is_file():
-            said = read_json(place / name).get(key)
-            if isinstance(said, str) and said not in (*NOT_GIVEN, UNKNOWN):
-                return said
-    found = set()
+        return {acknowledgement(place) or UNKNOWN}
+    for name in (CARD, "capture.json"):
+        told = read_json(place / name) if (place / name).is_file() else {}
+        said = told.get("licence")
+        if isinstance(said, str) and said not in (*NOT_GIVEN, UNKNOWN, MIXED):
+            return {said}
+        if told.get("parts"):
+            return {str(each) for part in told["parts"] for each in part.get("licences", [UNKNOWN])}
+    found: set[str] = set()
     for path in (place, place / "registration", place / "garment", place / "retarget"):
         if (path / "stage.json").is_file():
             sources = (read_record(path / "stage.json").get("sources") or {}).values()
-            found |= {_licence_of(Path(each), depth - 1) for each in sources if Path(each).resolve() != place.resolve()}
-    stated = sorted(found - {UNKNOWN})
-    if not stated or UNKNOWN in found:
-        return UNKNOWN if not stated else f"{'; '.join(stated)}; of the rest none is stated"
-    return "; ".join(stated)
+            for each in map(Path, sources):
+                if each.resolve() != place.resolve():
+                    found |= _licences_of(each, depth - 1)
+    return found or {UNKNOWN}
 
 
 # --- figures -----------------------------------------------------------------------------------------------------

@@ -39,7 +39,7 @@ class ExportConfig:
     """Picture of the cloth's colours over the template's UVs, as `texture` makes one; if absent, that of WORK/texture,
     if there is one; `none` leaves it out."""
     along: tuple[Along, ...] = ()
-    """What goes along: `body`, the body in the same formats and its motion as a bvh; `scans`, coloured, a ply a frame."""
+    """What goes along: `body`, the body in the same formats, its motion as a bvh; `scans`, coloured, a ply a frame."""
     normals: bool = True
     """Author each frame's vertex normals in USD and Alembic: every client shades alike, Blender shows a frame in three
     times the time."""

@@ -105,7 +105,7 @@ def test_an_export_is_told_of_its_motion_and_model(tmp_path: Path, capsys: pytes
 
 
 def test_cells_keep_their_columns_and_other_folders_have_no_card(tmp_path: Path):
-    part = Part("a|b", "line\nbreak", "x", UNKNOWN)
+    part = Part("a|b", "line\nbreak", "x", [UNKNOWN])
     card = Card("t", "learned garment", UNKNOWN, [part], [], {"capture4d": "1"}, "c", "")
     write_card(tmp_path, card)
     assert r"| a\|b | line break | not stated | `x` |" in (tmp_path / "README.md").read_text()
