@@ -13,8 +13,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from capture4d.app.cards.sources import with_card
 from capture4d.app.compare.config import CompareConfig
-from capture4d.app.export.export import export
+from capture4d.app.export.export import export, export_onnx, texture
 from capture4d.app.importing.folders import import_meshes, score
 from capture4d.app.status.work_folders import changes, diff, made_anew, needs_tracking, status
 from capture4d.app.status.work_folders import plan as plan
@@ -55,10 +56,10 @@ if TYPE_CHECKING:
     from retarget.animation.stage import Wearer
 
 __all__ = [
-    "animate", "calibrate", "check", "check_rig", "compare", "diff", "export", "extract", "fit", "fit_style",
+    "animate", "calibrate", "check", "check_rig", "compare", "diff", "export", "export_onnx", "extract", "fit", "fit_style",
     "fit_styles", "import_meshes", "offsets_apply", "offsets_draw", "offsets_edit", "offsets_predict", "offsets_train",
     "register", "register_mesh", "report", "run", "scan", "score", "status", "synth", "synth_board", "synth_drapes",
-    "template", "track", "wrinkles_apply", "wrinkles_maps", "wrinkles_offsets", "wrinkles_train",
+    "template", "texture", "track", "wrinkles_apply", "wrinkles_maps", "wrinkles_offsets", "wrinkles_train",
 ]  # fmt: skip
 
 
@@ -335,7 +336,8 @@ def fit(
     from retarget.fit_stage import run as stage
 
     opened = [opened_work(work) for work in works]
-    return stage(opened, Path(output), config or FitConfig(), device=device, workers=workers, overwrite=overwrite)
+    done = stage(opened, Path(output), config or FitConfig(), device=device, workers=workers, overwrite=overwrite)
+    return with_card(done)
 
 
 @logged_stage("animate")
@@ -406,11 +408,8 @@ def wrinkles_train(
     """
     from wrinkles.normal_maps.train_stage import run as stage
 
-    opened = [opened_work(work) for work in works]
-    return stage(
-        opened, Path(output), config or wrinkle_config.PRESETS["small"],
-        pairs=pairs, workers=workers, overwrite=overwrite,
-    )  # fmt: skip
+    opened, config = [opened_work(work) for work in works], config or wrinkle_config.PRESETS["small"]
+    return with_card(stage(opened, Path(output), config, pairs=pairs, workers=workers, overwrite=overwrite))
 
 
 @logged_stage("wrinkles apply")

@@ -6,6 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
+from capture4d.app.cards.sources import with_card
 from capture4d.captures.work_folder import AnyWork, opened_work
 from capture4d.errors import InputError
 from capture4d.runs.run_log import logged_stage
@@ -87,9 +88,8 @@ def offsets_train(
     from wrinkles.offset_images.train_stage import run as stage
 
     given = None if labels is None else Path(labels)
-    return stage(
-        Path(drapes), Path(output), config or DrapeOffsetsConfig(), labels=given, workers=workers, overwrite=overwrite
-    )
+    config = config or DrapeOffsetsConfig()
+    return with_card(stage(Path(drapes), Path(output), config, labels=given, workers=workers, overwrite=overwrite))
 
 
 @logged_stage("offsets predict")
@@ -255,7 +255,7 @@ def fit_styles(
     """
     from retarget.mixture.stage import run as stage
 
-    return stage(Path(styles), Path(output), config or StylesConfig(), workers=workers, overwrite=overwrite)
+    return with_card(stage(Path(styles), Path(output), config or StylesConfig(), workers=workers, overwrite=overwrite))
 
 
 def fit_style(

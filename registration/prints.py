@@ -19,8 +19,7 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from capture4d.body.sewing_pattern import with_known_pattern
-from capture4d.errors import InputError
+from capture4d.body.sewing_pattern import picture_span
 from capture4d.files.arrays import ArrayFile
 from capture4d.files.atomic import write_npz
 from capture4d.geometry.point_grid import PointGrid
@@ -144,12 +143,9 @@ def print_of_picture(
     Raises:
         InputError: the template has no UVs.
     """
+    low, high = picture_span(analysis.garment)
     uv = analysis.garment.template.uv
-    if uv is None:
-        raise InputError("template: expected UVs under the picture of its print, found none")
-    low, high = uv.reshape(-1, 2).min(axis=0).astype(np.float64), uv.reshape(-1, 2).max(axis=0).astype(np.float64)
-    if with_known_pattern(analysis.garment).pattern_metres != 1 and low.min() >= 0 and high.max() <= 1:
-        low, high = np.zeros(2), np.ones(2)
+    assert uv is not None
     corners = uv.astype(np.float64)
     lengths = np.linalg.norm(corners - corners[:, [1, 2, 0]], axis=2)
     edges = analysis.rest[analysis.faces]

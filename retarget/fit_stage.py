@@ -117,7 +117,10 @@ def run(
     }
     takes = read_takes(works)
     split_takes(names, [len(take.poses.frame_ids) for take in takes], takes[0].poses.fps, config.split)
-    stage = open_stage(output, name="fit", schema=SCHEMA, config=config, upstream=upstream, overwrite=overwrite)
+    stage = open_stage(
+        output, name="fit", schema=SCHEMA, config=config, upstream=upstream,
+        sources={name: work.path for name, work in zip(names, works, strict=True)}, overwrite=overwrite,
+    )  # fmt: skip
     if (output / "fit.json").is_file() and all((output / name).is_file() for name in _files(config)):
         return _finish(stage, config)
     lesson = _lesson(stage, takes, config, workers)

@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float32, Int32
+from jaxtyping import Float32, Float64, Int32
 
 from capture4d.errors import InputError
 from capture4d.geometry.mesh import face_areas, half_edges
@@ -21,7 +21,7 @@ from capture4d.geometry.tangents import TangentLayout, uv_corners
 from capture4d.types import Garment, Mesh
 from capture4d.units import METRES
 
-__all__ = ["PatternFit", "as_pattern", "fit_pattern", "with_known_pattern"]
+__all__ = ["PatternFit", "as_pattern", "fit_pattern", "picture_span", "picture_uv", "with_known_pattern"]
 
 PANEL_SHARE = 0.02
 """Share of the surface from which on a chart is a panel whose scale counts; smaller ones are trimmings."""
@@ -131,6 +131,35 @@ def as_pattern(mesh: Mesh) -> float:
             f"{fit.panel_scales:.2f}"
         )
     return fit.metres
+
+
+def picture_span(garment: Garment) -> tuple[Float64[np.ndarray, " 2"], Float64[np.ndarray, " 2"]]:
+    """The rectangle of UVs that a picture of the garment shows, its corners of least and largest u and v: 0 to 1, as
+    textures lie; the bounding box of UVs that are a pattern in metres, or reach beyond.
+
+    Raises:
+        InputError: the template has no UVs.
+    """
+    uv = garment.template.uv
+    if uv is None:
+        raise InputError("template: expected UVs under its picture, found none")
+    low, high = uv.reshape(-1, 2).min(axis=0).astype(np.float64), uv.reshape(-1, 2).max(axis=0).astype(np.float64)
+    if with_known_pattern(garment).pattern_metres != 1 and low.min() >= 0 and high.max() <= 1:
+        return np.zeros(2), np.ones(2)
+    return low, high
+
+
+def picture_uv(garment: Garment) -> Float32[np.ndarray, "faces 3 2"]:
+    """UVs such that the picture of `picture_span` fills the unit square.
+
+    Raises:
+        InputError: the template has no UVs, or such as have no area.
+    """
+    low, high = picture_span(garment)
+    if not (high > low).all():
+        raise InputError("template: expected UVs that spread the surface out, found none with any area")
+    assert garment.template.uv is not None
+    return np.clip((garment.template.uv.astype(np.float64) - low) / (high - low), 0, 1).astype(np.float32)
 
 
 def _weighted_percentile(values: np.ndarray, weights: np.ndarray, percent: float) -> float:

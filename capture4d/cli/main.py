@@ -21,7 +21,7 @@ from capture4d.cli.answers import TerminatedError, answer_to, complain
 from capture4d.cli.commands.capture import Calibrate, Check, CheckRig
 from capture4d.cli.commands.doctor import Doctor
 from capture4d.cli.commands.drape_offsets import OffsetsPredict, OffsetsTrain
-from capture4d.cli.commands.exchange import Export, Import, Score
+from capture4d.cli.commands.exchange import Export, ExportOnnx, Import, Score, Texture
 from capture4d.cli.commands.files import ConvertBody, ConvertPoses, ConvertRig, RegisterMesh, Template
 from capture4d.cli.commands.folders import Diff, Status
 from capture4d.cli.commands.models import Animate, Fit, FitStyle, FitStyles
@@ -74,7 +74,9 @@ COMMANDS: Mapping[str, Any] = {
     "offsets edit": OffsetsEdit,
     "offsets apply": OffsetsApply,
     "compare": Compare,
+    "texture": Texture,
     "export": Export,
+    "export-onnx": ExportOnnx,
     "import": Import,
     "score": Score,
     "register-mesh": RegisterMesh,

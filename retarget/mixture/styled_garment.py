@@ -140,6 +140,16 @@ class WornGarment:
         self._near: BodyCandidates | None = None
 
     @property
+    def under(self) -> Float64[np.ndarray, "verts 3"]:
+        """The points of the body that the garment is bound to, in the A-pose, metres."""
+        return self._under
+
+    @property
+    def canonical(self) -> Float64[np.ndarray, "verts 3"]:
+        """Displacements of this style on this person in the A-pose, metres."""
+        return self._canonical
+
+    @property
     def in_a_pose(self) -> Float64[np.ndarray, "verts 3"]:
         """The garment at rest in the A-pose, which is the body's rest pose, metres."""
         return self._under + self._canonical

@@ -80,7 +80,8 @@ def run(
     state = new_state(config)
     stage = open_stage(
         output, name="wrinkles train", schema=SCHEMA, config=config,
-        upstream={folder.work.resolve().name: folder.digest for folder in folders}, overwrite=overwrite,
+        upstream={folder.work.resolve().name: folder.digest for folder in folders},
+        sources={folder.work.resolve().name: folder.work for folder in folders}, overwrite=overwrite,
     )  # fmt: skip
     weights, measures = stage.path / "generator.safetensors", stage.path / "held_out.json"
     if stage.was_complete and weights.is_file() and measures.is_file():

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Int64
 
+from capture4d.app.export.albedo import Albedo, find_albedo
 from capture4d.app.export.skeleton import Skeleton
+from capture4d.body.sewing_pattern import picture_uv
 from capture4d.body.skinning import with_shape
 from capture4d.captures.work_folder import WorkFolder, load_registration
 from capture4d.errors import InputError
@@ -48,15 +50,20 @@ class Clip:
     skeleton: Skeleton | None
     """None of a garment without a body."""
     maps: MapFolder | None
+    albedo: Albedo | None
+    """Of the cloth's colours."""
     notes: Sequence[str]
     """What is worth telling, a sentence each."""
+    name: str = "garment"
+    """Of its files."""
 
 
-def read_clip(work: WorkFolder, frames: str = "", *, with_maps: bool = True) -> Clip:
+def read_clip(work: WorkFolder, frames: str = "", *, with_maps: bool = True, albedo: str | None = None) -> Clip:
     """
     Args:
         frames: those that are exported, as people write them; all if empty.
         with_maps: whether normal maps go along.
+        albedo: a picture of the cloth's colours, "none", or None for that of WORK/texture.
     Raises:
         InputError: nothing is registered, nobody knows the frame rate, or there are no such frames.
     """
@@ -81,13 +88,16 @@ def read_clip(work: WorkFolder, frames: str = "", *, with_maps: bool = True) -> 
             maps = None
         else:
             mesh = load_garment(maps.path / "template.npz").template  # its UVs are those of the maps
+    coloured = find_albedo(work, garment, albedo, notes)
+    if coloured is not None and maps is None:
+        mesh = replace(mesh, uv=picture_uv(garment))
     moving = MovingMesh(
         mesh.with_vertices(next(_rows(folder / "vertices.npy", rows))),
         ids[rows],
         _frame_rate(work),
         partial(_rows, folder / "vertices.npy", rows),
     )
-    return Clip(moving, _skeleton(work, garment, chosen), maps, notes)
+    return Clip(moving, _skeleton(work, garment, chosen), maps, coloured, notes)
 
 
 def _rows(path: Path, rows: Int64[np.ndarray, " chosen"]) -> Iterator[np.ndarray]:

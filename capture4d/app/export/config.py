@@ -7,10 +7,11 @@ from typing import Annotated, Literal, get_args
 
 from capture4d.settings import Positive, Range, settings
 
-__all__ = ["FORMATS", "ExportConfig", "Format", "GlbConfig"]
+__all__ = ["FORMATS", "Along", "ExportConfig", "Format", "GlbConfig"]
 
 Format = Literal["usd", "abc", "glb", "pc2", "mdd", "obj", "ply", "html"]
 FORMATS: tuple[Format, ...] = get_args(Format)
+Along = Literal["scans", "body"]
 
 
 @settings
@@ -34,6 +35,11 @@ class ExportConfig:
 
     maps: Literal["8", "16", "none"] = "8"
     """Bits of the normal maps of WORK/wrinkles/generated that go along, if there are any."""
+    albedo: str | None = None
+    """Picture of the cloth's colours over the template's UVs, as `texture` makes one; if absent, that of WORK/texture,
+    if there is one; `none` leaves it out."""
+    along: tuple[Along, ...] = ()
+    """What goes along: `body`, the body in the same formats, its motion as a bvh; `scans`, coloured, a ply a frame."""
     normals: bool = True
     """Author each frame's vertex normals in USD and Alembic: every client shades alike, Blender shows a frame in three
     times the time."""

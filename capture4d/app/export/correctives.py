@@ -118,7 +118,7 @@ def fit_targets(
 
     count = _fewest(is_enough, len(directions))
     base, directions, weights = _between_0_and_1(mean, directions[:count], coefficients[:, :count])
-    shape = (-1, len(moving.mesh.vertices), 3)
+    shape = (count, len(moving.mesh.vertices), 3)
     base = base.reshape(shape[1:])
     base_normals = angle_weighted_normals(base, moving.mesh.faces)
     shading = _normal_directions(moving, skeleton, base_normals, weights)
@@ -224,13 +224,13 @@ def _normal_directions(
                 normals = normalised(np.linalg.solve(blended, normals[..., None])[..., 0])
             wanted.append((normals - base_normals).ravel())
     found = np.linalg.lstsq(weights[chosen], np.array(wanted), rcond=None)[0]
-    return found.reshape(-1, *base_normals.shape)
+    return found.reshape(weights.shape[1], *base_normals.shape)
 
 
 def _world_error(moving: MovingMesh, skeleton: Skeleton | None, targets: SceneTargets) -> FitError:
     """Of the numbers as they are written."""
     tally = _Tally()
-    flat = targets.directions.reshape(len(targets.directions), -1)
+    flat = targets.directions.reshape(len(targets.directions), targets.base.size)
     for frame, vertices in enumerate(moving.frames()):
         made = targets.base.astype(np.float64) + (targets.weights[frame] @ flat).reshape(targets.base.shape)
         if skeleton is not None:

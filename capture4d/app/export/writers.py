@@ -23,17 +23,18 @@ from capture4d.mesh_files.animated.usd import read_usd, usd_faults, write_usd
 from capture4d.mesh_files.gltf.animated_scene import AnimatedScene, write_animated_glb
 from capture4d.mesh_files.meshes import read_mesh, write_mesh
 from capture4d.mesh_files.obj import obj_bytes
+from capture4d.types import Mesh
 
-__all__ = ["BASE", "Written", "file_of", "write_format", "write_sequence"]
+__all__ = ["ALBEDO_FILE", "MATERIAL", "Written", "file_of", "write_format", "write_sequence"]
 
-BASE = "garment.obj"
-"""The mesh that point caches belong to."""
-_FILES: Mapping[Format, str] = {
-    "usd": "garment.usdc", "abc": "garment.abc", "glb": "garment.glb", "pc2": "garment.pc2", "mdd": "garment.mdd",
-    "html": "garment.html",
+_SUFFIXES: Mapping[Format, str] = {
+    "usd": ".usdc", "abc": ".abc", "glb": ".glb", "pc2": ".pc2", "mdd": ".mdd", "html": ".html",
 }  # fmt: skip
+ALBEDO_FILE, MATERIAL = "albedo.png", "garment.mtl"
+"""The cloth's colours, and what tells of them beside an OBJ."""
 _SMOOTH = b"s 1\n"
 """One smoothing group: without it Blender shades an OBJ flat."""
+_MATERIAL = f"newmtl garment\nKd 1 1 1\nKs 0 0 0\nmap_Kd {ALBEDO_FILE}\n".encode()
 EXACT_MM = 0.001
 """What a format that keeps positions as they are may lose."""
 _GLB_AGREES_MM = 0.002
@@ -55,9 +56,10 @@ class Written:
     """What is above a limit that was asked for."""
 
 
-def file_of(kind: Format) -> str | None:
-    """The name of the one file of a format; None where there is a file for each frame."""
-    return _FILES.get(kind)
+def file_of(kind: Format, name: str) -> str | None:
+    """The one file of a format, of what bears a name; None where there is a file for each frame."""
+    suffix = _SUFFIXES.get(kind)
+    return None if suffix is None else f"{name}{suffix}"
 
 
 def write_format(kind: Format, folder: Path, clip: Clip, config: ExportConfig) -> Written:
@@ -67,11 +69,12 @@ def write_format(kind: Format, folder: Path, clip: Clip, config: ExportConfig) -
         InputError: the format cannot hold these frames, needs a package that is not installed, or what is read back is
             not what was written.
     """
-    path, moving = folder / _FILES[kind], clip.moving
+    path, moving = folder / f"{clip.name}{_SUFFIXES[kind]}", clip.moving
     match kind:
         case "usd":
             maps = [f"./{map_name(frame_id)}" for frame_id in moving.frame_ids.tolist()] if clip.maps else []
-            write_usd(path, moving, maps=maps, normals=config.normals)
+            albedo = f"./{ALBEDO_FILE}" if clip.albedo else None
+            write_usd(path, moving, name=clip.name, maps=maps, albedo=albedo, normals=config.normals)
             _require_no_faults(path, usd_faults(path))
             found = read_usd(path)
         case "abc":
@@ -91,9 +94,10 @@ def write_format(kind: Format, folder: Path, clip: Clip, config: ExportConfig) -
         case _:
             raise AssertionError(f"{kind} has a file for each frame")
     if kind in ("pc2", "mdd"):
-        write_bytes(folder / BASE, _SMOOTH + obj_bytes(moving.mesh, None, None))
-        base = read_mesh(folder / BASE).mesh
-        _require_close(folder / BASE, 1000 * float(np.abs(base.vertices - moving.mesh.vertices).max()), EXACT_MM)
+        mesh_path = folder / f"{clip.name}.obj"  # the mesh that the cache belongs to
+        _write_obj(mesh_path, moving.mesh, folder if clip.albedo else None)
+        base = read_mesh(mesh_path).mesh
+        _require_close(mesh_path, 1000 * float(np.abs(base.vertices - moving.mesh.vertices).max()), EXACT_MM)
     error = 1000 * largest_difference(moving, found)
     _require_close(path, error, EXACT_MM)
     return Written(path.name, error)
@@ -101,13 +105,13 @@ def write_format(kind: Format, folder: Path, clip: Clip, config: ExportConfig) -
 
 def write_sequence(kind: Format, folder: Path, clip: Clip) -> Written:
     """A mesh file for each frame that has none yet; each is read back."""
-    largest = 0.0
+    largest, place = 0.0, kind if clip.name == "garment" else f"{clip.name}-{kind}"
     for frame_id, vertices in zip(clip.moving.frame_ids.tolist(), clip.moving.frames(), strict=True):
-        path = folder / kind / f"{frame_id:06d}.{kind}"
+        path = folder / place / f"{frame_id:06d}.{kind}"
         mesh = clip.moving.mesh.with_vertices(vertices)
         if not path.is_file():
             if kind == "obj":
-                write_bytes(path, _SMOOTH + obj_bytes(mesh, None, None))
+                _write_obj(path, mesh, path.parent if clip.albedo else None)
             else:
                 write_mesh(path, mesh)
         found = read_mesh(path).mesh
@@ -115,7 +119,19 @@ def write_sequence(kind: Format, folder: Path, clip: Clip) -> Written:
             raise InputError("read back: expected the faces that were written, found others", where=path)
         largest = max(largest, 1000 * float(np.linalg.norm(found.vertices - mesh.vertices, axis=1).max()))
         _require_close(path, largest, EXACT_MM)
-    return Written(f"{kind}/", largest)
+    return Written(f"{place}/", largest)
+
+
+def _write_obj(path: Path, mesh: Mesh, coloured: Path | None) -> None:
+    """Args: coloured: the folder that gets the material, and the colours themselves if they lie above it."""
+    head = _SMOOTH
+    if coloured is not None:
+        if not (coloured / ALBEDO_FILE).exists():  # other tools look beside a file, as our reader does
+            write_bytes(coloured / ALBEDO_FILE, (coloured.parent / ALBEDO_FILE).read_bytes())
+        if not (coloured / MATERIAL).exists():
+            write_bytes(coloured / MATERIAL, _MATERIAL)
+        head = f"mtllib {MATERIAL}\nusemtl garment\n".encode() + head
+    write_bytes(path, head + obj_bytes(mesh, None, None))
 
 
 def _write_glb(path: Path, clip: Clip, config: ExportConfig) -> Written:
@@ -134,7 +150,9 @@ def _write_glb(path: Path, clip: Clip, config: ExportConfig) -> Written:
     times = (moving.times_s() - moving.times_s()[0]).astype(np.float32)
     skin = None if skeleton is None else skeleton.scene_skin()
     clock = {"fps": moving.fps, "first_frame": first}
-    write_animated_glb(path, AnimatedScene(moving.mesh, times, targets, skin, still, {"capture4d": told}, clock))
+    colours = None if clip.albedo is None else (path.parent / ALBEDO_FILE).read_bytes()
+    scene = AnimatedScene(moving.mesh, times, targets, skin, still, colours, {"capture4d": told}, clock)
+    write_animated_glb(path, scene)
     found = 1000 * largest_glb_difference(path, moving)
     _require_close(path, found, error.max_mm + _GLB_AGREES_MM)
     at_99, at_most = (glb.p99_mm, glb.max_mm) if glb.motion == "skinned" else (EXACT_MM, EXACT_MM)

@@ -20,6 +20,7 @@ from capture4d.app.drawing.panels import VIEWS, Framing, Panel, data_uri
 from capture4d.app.drawing.render import Drawn, View, render
 from capture4d.app.report.flagged import FLAGGED_NOTE, flagged_table, verdict_counts, verdict_runs
 from capture4d.app.report.metrics import column, shown
+from capture4d.app.report.moving import exported_page, shows_it
 from capture4d.app.report.take import is_current, spread
 from capture4d.app.report.take_page import flat, metrics_table
 from capture4d.body.skinning import pose_frame, with_shape
@@ -63,7 +64,7 @@ def run(work: WorkFolder, *, workers: int = 1, overwrite: bool = False) -> Stage
     command = f"capture4d animate MODEL --poses FILE --output {work.path}"
     digest = require_complete(work.path / "registration", ANIMATE, command)
     current = {"schema": SCHEMA, "config": {}, "upstream": {"registration": digest}}
-    if not overwrite and is_current(folder, current):
+    if not overwrite and is_current(folder, current) and shows_it(folder, exported_page(work.path)):
         return result_of(folder, folder / "index.html")
     stale = (folder / "stage.json").exists()
     stage = open_stage(folder, name="report", schema=SCHEMA, config={}, upstream=current["upstream"], overwrite=stale)
@@ -181,6 +182,7 @@ def _page(
         charts=_charts(records),
         columns=4,
         calibration=None,
+        moving=exported_page(work.path),
         comparison=None,
         tracking=None,
         extraction=[],

@@ -21,6 +21,7 @@ from capture4d.app.drawing.palette import HEIGHT, WIDTH
 from capture4d.app.drawing.panels import VIEWS, Framing, Panel, Scale, draw_frame, readable_scan
 from capture4d.app.drawing.render import Drawn, heat_colours, render, trace
 from capture4d.app.report.metrics import METRICS, own_measures, summarise, truth_measures
+from capture4d.app.report.moving import exported_page, shows_it
 from capture4d.app.report.stages import calibration, comparison, comparison_digest, draw_stages, tracking
 from capture4d.app.report.take_page import Drawings, Stages, take_page
 from capture4d.captures.capture import Capture, read_capture
@@ -83,7 +84,7 @@ def run(
     opened = capture or read_capture(place)
     upstream = shown_from(work.path, opened, registered)
     current = {"schema": SCHEMA, "config": asdict(config), "upstream": upstream}
-    if not overwrite and is_current(folder, current):
+    if not overwrite and is_current(folder, current) and shows_it(folder, exported_page(work.path)):
         return result_of(folder, folder / "index.html")
     stale = (folder / "stage.json").exists()
     stage = open_stage(folder, name="report", schema=SCHEMA, config=config, upstream=upstream, overwrite=stale)

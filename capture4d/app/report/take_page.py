@@ -17,6 +17,7 @@ from capture4d.app.drawing.palette import BLUE, GREEN, GREY, ORANGE
 from capture4d.app.drawing.panels import Panel, Scale
 from capture4d.app.report.flagged import FLAGGED_NOTE, flagged_table, verdict_counts, verdict_runs
 from capture4d.app.report.metrics import METRICS, column, region_rows, shown
+from capture4d.app.report.moving import exported_page
 from capture4d.app.report.stages import Calibration, Comparison, StagePictures, Tracking
 from capture4d.captures.capture import Capture
 from capture4d.captures.work_folder import VERDICTS, WorkFolder
@@ -153,6 +154,7 @@ def take_page(
             for row, panels in sorted(drawings.frames.items())
         ],
         calibration=stages.calibration,
+        moving=exported_page(work.path),
         comparison=_comparison_part(stages.comparison),
         tracking=_tracking_part(stages.tracking),
         extraction=[{"frame_id": records[each.row]["frame_id"], "panels": each.extraction} for each in stages.pictures],

@@ -32,7 +32,7 @@ __all__ = ["StageStatus", "WorkStatus", "as_json", "logged_costs", "survey"]
 State = Literal["done", "running", "stopped", "stale", "damaged"]
 CHAIN = {"garment": "extract", "body": "track", "registration": "register", "report": "report"}
 """Folders of the stages of `run`, in their order; others come after them."""
-BESIDE = ("retarget", "compare", "wrinkles/pairs", "wrinkles/generated", "wrinkles/offsets")
+BESIDE = ("retarget", "compare", "wrinkles/pairs", "wrinkles/generated", "wrinkles/offsets", "texture")
 """Folders of what is made from these."""
 GRADED = ("track", REGISTER, ANIMATE)
 """Stages that give each frame a verdict."""

@@ -1,24 +1,49 @@
-"""`capture4d export`, `import` and `score`: a garment out to other tools, and back."""
+"""`capture4d texture`, `export`, `export-onnx`, `import` and `score`: a garment out to other tools, and back."""
 
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, get_args
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from capture4d.app.export.config import FORMATS, ExportConfig, Format
+from capture4d.app.export.config import FORMATS, Along, ExportConfig, Format
 from capture4d.app.importing.config import ImportConfig
+from capture4d.app.onnx_models.config import OnnxConfig
 from capture4d.cli.exit_codes import BAD_RESULT, GOOD
 from capture4d.cli.options import MeshOptions, ProgressOptions, StageOptions
 from capture4d.errors import CommandLineError
+from capture4d.texturing.config import TextureConfig
 
 if TYPE_CHECKING:
     from capture4d.app.export.correctives import FitError
 
-__all__ = ["Export", "Import", "Score"]
+__all__ = ["Export", "ExportOnnx", "Import", "Score", "Texture"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Texture(StageOptions):
+    """Bake the colours of a take's scans to the template's UVs: one picture, without the light that fell on them."""
+
+    work: Annotated[Positional[Path], arg(metavar="WORK")]
+    """Work folder of a registered take; gets texture/."""
+    config: Annotated[TextureConfig, arg(name="")] = field(default_factory=TextureConfig)
+
+    def __call__(self) -> int:
+        from capture4d import pipeline
+        from capture4d.files.atomic import read_json
+
+        result = pipeline.texture(self.work, self.config, workers=self.workers, overwrite=self.overwrite)
+        told = read_json(result.path / "texture.json")
+        dark, bright = told["light"]
+        print(
+            f"texture: {result.frames} frames, {100 * told['seen_share']:.1f} % of it seen, frames differ by "
+            f"{told['spread_levels']:.1f} levels, light from {dark:.2f} to {bright:.2f}"
+        )
+        print(f"albedo: {result.path / 'albedo.png'}")
+        return GOOD
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,6 +70,8 @@ class Export(_Alone):
     """Folder to write; WORK/exports if absent."""
     frames: str = ""
     """Only these frames of the take, such as 1,5,10-20 or, every fifth, 1-200:5."""
+    with_: Annotated[str, arg(name="with", metavar="PARTS")] = ""
+    """What goes along: scans, body, or scans,body; short for --along scans body."""
     config: Annotated[ExportConfig, arg(name="")] = field(default_factory=ExportConfig)
 
     def __call__(self) -> int:
@@ -60,9 +87,8 @@ class Export(_Alone):
                 print(f"capture4d: {line}", file=sys.stderr)
         elif not formats:
             formats = [default_format()]
-        done = pipeline.export(
-            self.work, formats, self.output, self.config, frames=self.frames, overwrite=self.overwrite
-        )
+        config = replace(self.config, along=(*dict.fromkeys((*self.config.along, *_parts(self.with_))),))
+        done = pipeline.export(self.work, formats, self.output, config, frames=self.frames, overwrite=self.overwrite)
         for note in done.notes:
             print(f"capture4d: {self.work}: {note}", file=sys.stderr)
         if not self.all and not self.format and formats == ["glb"]:
@@ -74,6 +100,39 @@ class Export(_Alone):
             print(f"capture4d: {line}", file=sys.stderr)
         print(f"exports: {done.result.path}")
         return BAD_RESULT if broken else GOOD
+
+
+def _parts(said: str) -> list[Along]:
+    found: list[Along] = []
+    for word in filter(None, (part.strip() for part in said.split(","))):
+        if word not in get_args(Along):
+            raise CommandLineError(f"--with: expected scans, body or both, found '{word}'")
+        found.append(word)
+    return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportOnnx(_Alone):
+    """Write a learned garment or a wrinkle network as an ONNX file, which runs without capture4d, and compare both."""
+
+    model: Annotated[Positional[Path], arg(metavar="MODEL")]
+    """Folder of `fit`, `fit-styles` or `wrinkles train`."""
+    output: Path | None = None
+    """Folder to write; MODEL/onnx if absent."""
+    config: Annotated[OnnxConfig, arg(name="")] = field(default_factory=OnnxConfig)
+
+    def __call__(self) -> int:
+        from capture4d import pipeline
+
+        result, found = pipeline.export_onnx(self.model, self.output, self.config, overwrite=self.overwrite)
+        print(
+            f"export-onnx: {found.kind}, differs by {found.mean:.2g} {found.unit} in the mean, {found.largest:.2g} at "
+            f"most; {found.onnx_ms:.2f} ms, in {found.ours_by} {found.ours_ms:.2f}"
+        )
+        print(f"onnx: {result.path}")
+        for line in found.faults:
+            print(f"capture4d: {line}", file=sys.stderr)
+        return BAD_RESULT if found.faults else GOOD
 
 
 def _error(largest: float, fit: FitError | None, targets: int | None) -> str:

@@ -143,22 +143,25 @@ class SynthDrapes(StageOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class Demo(StageOptions):
-    """Make a synthetic capture, calibrate, track, register, learn the garment, put it on another body: in minutes."""
+    """Make a synthetic capture, calibrate, track, register, learn the garment, put it on another body, export it: in
+    minutes."""
 
     output: Path = Path("out")
     """Folder for everything, the capture included."""
 
     def __call__(self) -> int:
-        report, other = run_demo(self.output, workers=self.workers, overwrite=self.overwrite)
+        report, other, exports = run_demo(self.output, workers=self.workers, overwrite=self.overwrite)
         print(f"report: {report}")
         print(f"on another body: {other}")
+        print(f"for Blender: {exports / 'open_in_blender.py'}")
+        print(f"in motion: {exports / 'garment.html'}")
         return GOOD
 
 
-def run_demo(output: Path, *, workers: int, overwrite: bool = False) -> tuple[Path, Path]:
+def run_demo(output: Path, *, workers: int, overwrite: bool = False) -> tuple[Path, Path, Path]:
     """Synthesise `output`/capture, calibrate its rig from photographs of a board, run everything on the scans, the true
-    poses left aside, learn the garment and its wrinkles, compare what was learned, and put the garment on another body;
-    the paths of the two reports."""
+    poses left aside, learn the garment and its wrinkles, compare what was learned, put the garment on another body
+    and hand it on; the paths of the two reports, and the folder of the exports."""
     from capture4d import pipeline
     from capture4d.app.compare.config import CompareConfig
     from data_synth.config import PRESETS, BoardConfig
@@ -185,4 +188,24 @@ def run_demo(output: Path, *, workers: int, overwrite: bool = False) -> tuple[Pa
     report = pipeline.report(output, capture=capture, **how)
     poses, other = output / "body" / "poses.npz", Wearer(beta=OTHER_PERSON)
     pipeline.animate(output / "retarget", poses, output / "other", wearer=other, **how)
-    return report.path, pipeline.report(output / "other", **how).path
+    pipeline.texture(output, **how)
+    exports = hand_on(output / "other", model, output / "texture" / "albedo.png", **how)
+    return report.path, pipeline.report(output / "other", **how).path, exports
+
+
+def hand_on(work: Path, model: Path, albedo: Path, *, workers: int, overwrite: bool = False) -> Path:
+    """Make the wrinkles of an animated garment and export it with them and its colours: as USD where that is
+    installed, else as GLB, and as a page; the folder of the exports.
+
+    Args:
+        model: what `wrinkles train` wrote.
+        albedo: what `texture` wrote.
+    """
+    from capture4d import pipeline
+    from capture4d.app.export.config import ExportConfig
+    from capture4d.app.export.stage import default_format
+
+    pipeline.wrinkles_apply(model, work, workers=workers, overwrite=overwrite)
+    formats = [default_format(), "html"]
+    done = pipeline.export(work, formats, config=ExportConfig(albedo=str(albedo)), overwrite=overwrite)
+    return done.result.path

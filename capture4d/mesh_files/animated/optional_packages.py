@@ -8,9 +8,10 @@ from typing import Any
 
 from capture4d.errors import InputError
 
-__all__ = ["ALEMBIC", "USD", "is_installed", "package_module"]
+__all__ = ["ALEMBIC", "ONNX", "ONNX_RUNTIME", "USD", "is_installed", "package_module"]
 
 USD, ALEMBIC = ("pxr", "usd"), ("alembic3d", "alembic")
+ONNX, ONNX_RUNTIME = ("onnx", "onnx"), ("onnxruntime", "onnx")
 """What is imported, and the extra of this project that installs it."""
 
 
@@ -20,7 +21,7 @@ def is_installed(package: tuple[str, str]) -> bool:
 
 
 def package_module(package: tuple[str, str], name: str) -> Any:
-    """A module of the package, such as "UsdGeom"; untyped, for the package may be absent.
+    """A module of the package, such as "UsdGeom", or "" for the package itself; untyped, for it may be absent.
 
     Raises:
         InputError: it is not installed; says how it is installed.
@@ -29,4 +30,4 @@ def package_module(package: tuple[str, str], name: str) -> Any:
         raise InputError(
             f"expected the Python package '{package[0]}', found none; run: pip install 'capture4d[{package[1]}]'"
         )
-    return importlib.import_module(f"{package[0]}.{name}")
+    return importlib.import_module(f"{package[0]}.{name}" if name else package[0])

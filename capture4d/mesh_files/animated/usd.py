@@ -30,13 +30,20 @@ _CLOTH = (0.03, 0.12, 0.58)
 
 
 def write_usd(
-    path: Path, moving: MovingMesh, *, name: str = "garment", maps: Sequence[str] = (), normals: bool = True
+    path: Path,
+    moving: MovingMesh,
+    *,
+    name: str = "garment",
+    maps: Sequence[str] = (),
+    albedo: str | None = None,
+    normals: bool = True,
 ) -> None:
     """Write a .usdc, .usda or .usd file.
 
     Args:
         name: of the prim.
         maps: normal map of each frame, +Y, as a path relative to the file.
+        albedo: picture of the colours, sRGB, likewise.
         normals: author the area-weighted vertex normals of each frame, so that every client shades alike.
     Raises:
         InputError: usd-core is not installed, or nobody knows the frame rate.
@@ -55,7 +62,9 @@ def write_usd(
     stage.SetDefaultPrim(root.GetPrim())
     mesh = _topology(stage, f"/{name}/mesh", moving.mesh, normals)
     if moving.mesh.uv is not None:
-        _material(stage, f"/{name}/material", mesh, moving.frame_ids.tolist(), maps)
+        look = _material(stage, f"/{name}/material", mesh)
+        if maps or albedo is not None:
+            _textures(stage, look, moving.frame_ids.tolist(), maps, albedo)
     points, extent, shading = mesh.GetPointsAttr(), mesh.GetExtentAttr(), mesh.GetNormalsAttr()
     for at, (frame_id, vertices) in enumerate(zip(moving.frame_ids.tolist(), moving.frames(), strict=True)):
         points.Set(_vectors(vertices), frame_id)
@@ -95,8 +104,8 @@ def _topology(stage: Any, place: str, mesh: Mesh, normals: bool) -> Any:
     return made
 
 
-def _material(stage: Any, place: str, mesh: Any, frame_ids: Sequence[int], maps: Sequence[str]) -> None:
-    """A surface of cloth, with the normal map of each frame if there are maps."""
+def _material(stage: Any, place: str, mesh: Any) -> str:
+    """A surface of cloth; its place."""
     UsdShade, Sdf, Gf = (package_module(USD, each) for each in ("UsdShade", "Sdf", "Gf"))
     types = Sdf.ValueTypeNames
     look = UsdShade.Material.Define(stage, place)
@@ -106,24 +115,38 @@ def _material(stage: Any, place: str, mesh: Any, frame_ids: Sequence[int], maps:
     surface.CreateInput("roughness", types.Float).Set(0.85)
     look.CreateSurfaceOutput().ConnectToSource(surface.ConnectableAPI(), "surface")
     UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(look)
-    if not maps:
-        return
+    return place
+
+
+def _textures(stage: Any, place: str, frame_ids: Sequence[int], maps: Sequence[str], albedo: str | None) -> None:
+    """The normal map of each frame, and the colours, on a surface."""
+    UsdShade, Sdf, Gf = (package_module(USD, each) for each in ("UsdShade", "Sdf", "Gf"))
+    types, surface = Sdf.ValueTypeNames, UsdShade.Shader(stage.GetPrimAtPath(f"{place}/preview"))
     reader = UsdShade.Shader.Define(stage, f"{place}/st")
     reader.CreateIdAttr("UsdPrimvarReader_float2")
     reader.CreateInput("varname", types.String).Set("st")
-    texture = UsdShade.Shader.Define(stage, f"{place}/normal")
-    texture.CreateIdAttr("UsdUVTexture")
-    file = texture.CreateInput("file", types.Asset)
-    file.Set(maps[0])
-    for frame_id, each in zip(frame_ids, maps, strict=True):
-        file.Set(each, frame_id)
-    texture.CreateInput("sourceColorSpace", types.Token).Set("raw")
-    texture.CreateInput("scale", types.Float4).Set(Gf.Vec4f(2, 2, 2, 1))
-    texture.CreateInput("bias", types.Float4).Set(Gf.Vec4f(-1, -1, -1, 0))
-    for side in ("wrapS", "wrapT"):
-        texture.CreateInput(side, types.Token).Set("clamp")
-    texture.CreateInput("st", types.Float2).ConnectToSource(reader.CreateOutput("result", types.Float2))
-    surface.CreateInput("normal", types.Normal3f).ConnectToSource(texture.CreateOutput("rgb", types.Float3))
+    places = reader.CreateOutput("result", types.Float2)
+
+    def texture(name: str, first: str, space: str) -> Any:
+        made = UsdShade.Shader.Define(stage, f"{place}/{name}")
+        made.CreateIdAttr("UsdUVTexture")
+        made.CreateInput("file", types.Asset).Set(first)
+        made.CreateInput("sourceColorSpace", types.Token).Set(space)
+        for side in ("wrapS", "wrapT"):
+            made.CreateInput(side, types.Token).Set("clamp")
+        made.CreateInput("st", types.Float2).ConnectToSource(places)
+        return made
+
+    if maps:
+        normal = texture("normal", maps[0], "raw")
+        for frame_id, each in zip(frame_ids, maps, strict=True):
+            normal.GetInput("file").Set(each, frame_id)
+        normal.CreateInput("scale", types.Float4).Set(Gf.Vec4f(2, 2, 2, 1))
+        normal.CreateInput("bias", types.Float4).Set(Gf.Vec4f(-1, -1, -1, 0))
+        surface.CreateInput("normal", types.Normal3f).ConnectToSource(normal.CreateOutput("rgb", types.Float3))
+    if albedo is not None:
+        colours = texture("albedo", albedo, "sRGB")
+        surface.GetInput("diffuseColor").ConnectToSource(colours.CreateOutput("rgb", types.Float3))
 
 
 def usd_faults(path: Path) -> list[str]:

@@ -71,6 +71,8 @@ class AnimatedScene:
     skin: SceneSkin | None = None
     normal_map: bytes | None = None
     """A PNG, +Y."""
+    base_colours: bytes | None = None
+    """A PNG, sRGB."""
     asset_extras: Mapping[str, Any] = field(default_factory=dict)
     scene_extras: Mapping[str, Any] = field(default_factory=dict)
 
@@ -117,7 +119,7 @@ def write_animated_glb(path: Path, scene: AnimatedScene) -> None:
         "scene": 0,
         "nodes": [{"name": "garment", "mesh": 0}],
         "meshes": [mesh],
-        **_material(buffer, scene.normal_map),
+        **_material(buffer, scene),
     }
     channels: list[dict[str, Any]] = []
     samplers: list[dict[str, Any]] = []
@@ -182,17 +184,29 @@ def _mesh(buffer: _Buffer, scene: AnimatedScene) -> tuple[np.ndarray, dict[str, 
     return vertex, mesh
 
 
-def _material(buffer: _Buffer, normal_map: bytes | None) -> dict[str, Any]:
-    surface = {"baseColorFactor": [0.03, 0.12, 0.58, 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.85}
+def _material(buffer: _Buffer, scene: AnimatedScene) -> dict[str, Any]:
+    surface: dict[str, Any] = {
+        "baseColorFactor": [0.03, 0.12, 0.58, 1.0],
+        "metallicFactor": 0.0,
+        "roughnessFactor": 0.85,
+    }
     material: dict[str, Any] = {"name": "garment", "doubleSided": True, "pbrMetallicRoughness": surface}
-    if normal_map is None:
+    images: list[dict[str, Any]] = []
+    for name, picture in (("normal", scene.normal_map), ("albedo", scene.base_colours)):
+        if picture is None:
+            continue
+        if name == "normal":
+            material["normalTexture"] = {"index": len(images)}
+        else:
+            surface |= {"baseColorTexture": {"index": len(images)}, "baseColorFactor": [1.0, 1.0, 1.0, 1.0]}
+        images.append({"bufferView": buffer.view(picture), "mimeType": "image/png", "name": name})
+    if not images:
         return {"materials": [material]}
-    material["normalTexture"] = {"index": 0}
     return {
         "materials": [material],
-        "textures": [{"source": 0, "sampler": 0}],
+        "textures": [{"source": each, "sampler": 0} for each in range(len(images))],
         "samplers": [{"magFilter": _LINEAR, "minFilter": _MIPMAPS, "wrapS": _CLAMP, "wrapT": _CLAMP}],
-        "images": [{"bufferView": buffer.view(normal_map), "mimeType": "image/png", "name": "normal"}],
+        "images": images,
     }
 
 

@@ -1,0 +1,1 @@
+"""What was learned, as ONNX files that run without this project."""

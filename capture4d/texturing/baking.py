@@ -1,0 +1,117 @@
+"""What one scan says of the colours of the template.
+
+From each place a ray along the normal and one against it look for the scan, then the nearest point of the scan may
+answer; its colour is interpolated between the three vertices of the face. An answer weighs the less the farther away
+it is, and the more it faces another way; next to a scan's open border, where its vertices mix cloth with what is beside
+it, it hardly weighs at all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+
+from capture4d.geometry.mesh import boundary_edges, normalised, vertex_normals
+from capture4d.geometry.mesh_kernels import laplacian_pass
+from capture4d.geometry.ray_casting import TriangleScene, barycentric
+from capture4d.geometry.uv_raster import UvRaster
+from capture4d.types import GarmentScan
+
+__all__ = ["ColouredScan", "SeenColours", "as_bytes", "surface_blocks"]
+
+GATE = 0.5
+"""Least cosine between the normals of template and scan."""
+HALF_M = 0.5
+"""Of the distance that is looked through: where an answer's weight has fallen to 1/e."""
+BESIDE_BORDER = 0.02
+"""Weight next to a scan's open border."""
+SMOOTHED = 2
+"""How often normals of a scan are averaged with their neighbours': the noise of vertices goes, folds stay."""
+BLOCK = 1 << 18
+"""Places that are looked up together: memory does not grow with the picture."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SeenColours:
+    """Colours at n places of the template."""
+
+    colours: Float32[np.ndarray, "n 3"]
+    """sRGB, 0 to 255; 0 where nothing is seen."""
+    normals: Float32[np.ndarray, "n 3"]
+    """Of the scan there, world."""
+    weights: Float32[np.ndarray, " n"]
+    """0 where nothing is seen, at most 1."""
+
+
+class ColouredScan:
+    """A garment's scan that is looked up. Its colours must be there.
+
+    Args:
+        distance_m: how far from a place the scan is looked for.
+    """
+
+    def __init__(self, scan: GarmentScan, distance_m: float) -> None:
+        assert scan.colours is not None
+        mesh, self._colours, self._far = scan.mesh, scan.colours, distance_m
+        self._faces, self._scene = mesh.faces, TriangleScene((mesh.vertices, mesh.faces))
+        normals: Any = vertex_normals(mesh.vertices.astype(np.float64), mesh.faces)
+        for _ in range(SMOOTHED):
+            normals = laplacian_pass(normals, mesh.faces, np.zeros(len(normals), bool))
+        self._normals = normalised(normals)
+        self._trust = np.ones(len(mesh.vertices), np.float32)
+        self._trust[boundary_edges(mesh.faces)] = BESIDE_BORDER
+
+    def seen_from(self, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]) -> SeenColours:
+        """Look it up.
+
+        Args:
+            points: on the registered template, metres, world.
+            normals: of the template there, of length 1.
+        """
+        points, normals = points.astype(np.float32), normals.astype(np.float32)
+        found = SeenColours(np.zeros_like(points), np.zeros_like(points), np.zeros(len(points), np.float32))
+        nearest = np.full(len(points), np.inf, np.float32)
+
+        def accept(index: np.ndarray, distance: np.ndarray, face: np.ndarray, uv: np.ndarray) -> None:
+            near = (distance <= self._far) & (distance < nearest[index])
+            index, distance, face, uv = index[near], distance[near], face[near], uv[near]
+            corners, shares = self._faces[face], barycentric(uv)
+            turned = normalised(np.einsum("nk,nkc->nc", shares, self._normals[corners]))
+            cosine = np.einsum("nc,nc->n", turned, normals[index])
+            good = cosine >= GATE
+            index, corners, shares, turned = index[good], corners[good], shares[good], turned[good]
+            nearest[index] = distance[good]
+            weight = cosine[good] * np.exp(-((distance[good] / (HALF_M * self._far)) ** 2))
+            found.weights[index] = weight * self._trust[corners].min(axis=1)
+            found.colours[index] = np.einsum("nk,nkc->nc", shares, self._colours[corners].astype(np.float32))
+            found.normals[index] = turned
+
+        for direction in (normals, -normals):
+            met = self._scene.cast(np.concatenate([points, direction], axis=1))
+            hit = np.flatnonzero(np.isfinite(met.distance))
+            accept(hit, met.distance[hit], met.faces[hit], met.uv[hit])
+        missing = np.flatnonzero(found.weights == 0)
+        if len(missing):
+            close = self._scene.nearest(points[missing])
+            accept(missing, np.linalg.norm(close.points - points[missing], axis=1), close.faces, close.uv)
+        return found
+
+
+def surface_blocks(
+    raster: UvRaster, vertices: Float[np.ndarray, "verts 3"], faces: np.ndarray
+) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
+    """Texels, a block at a time, with their places and normals on a posed template."""
+    places, normals = vertices.astype(np.float64), vertex_normals(vertices.astype(np.float64), faces)
+    for start in range(0, len(raster.texels), BLOCK):
+        block = slice(start, start + BLOCK)
+        part = raster.part(block)
+        yield block, part.at_vertices(places), normalised(part.at_vertices(normals))
+
+
+def as_bytes(values: np.ndarray) -> UInt8[np.ndarray, "..."]:
+    """The nearest levels."""
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)

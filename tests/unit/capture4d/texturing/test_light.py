@@ -1,0 +1,68 @@
+"""Light that is known is found, whatever is printed on the cloth; what nobody can tell stays in the colours."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from capture4d.texturing.light import Light, fit_light, harmonics
+
+AREA_M2 = 0.5
+
+
+def turning(frames: int, places: int, rng: np.random.Generator, reach_deg: float) -> np.ndarray:
+    """(T, n, 3) normals of places on a person who turns to and fro, with folds."""
+    still = rng.standard_normal((places, 3))
+    still /= np.linalg.norm(still, axis=1, keepdims=True)
+    angles = np.radians(reach_deg) * np.sin(np.linspace(0, 3, frames))
+    turned = np.stack([Rotation.from_rotvec([0, angle, 0]).apply(still) for angle in angles])
+    turned = turned + 0.15 * rng.standard_normal(turned.shape)
+    return (turned / np.linalg.norm(turned, axis=2, keepdims=True)).astype(np.float32)
+
+
+def lamps(normals: np.ndarray) -> np.ndarray:
+    """A warm lamp in front, and light from everywhere."""
+    lambert = np.clip(normals @ np.array([0.3, 0.6, 0.74]), 0, None)
+    return np.array([0.55, 0.6, 0.62]) + lambert[..., None] * np.array([0.5, 0.4, 0.3])
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_lamp_is_divided_out_though_front_and_back_are_of_different_cloth(seed: int):
+    rng = np.random.default_rng(seed)
+    normals = turning(8, 3000, rng, 50)
+    albedo = rng.uniform(60, 200, (3000, 3))
+    albedo[normals[0, :, 2] > 0] *= 0.7  # what a lamp from behind would make of it
+    noisy = normals + 0.15 * rng.standard_normal(normals.shape).astype(np.float32)
+    noisy /= np.linalg.norm(noisy, axis=2, keepdims=True)
+    gains = np.exp(0.03 * rng.standard_normal((8, 1, 3)))
+    colours = albedo * lamps(normals) * gains + rng.normal(0, 2, (8, 3000, 3))
+    weights = (rng.uniform(size=(8, 3000)) > 0.3).astype(np.float32)
+    colours[5, :200], weights[5, :200] = 20, 1.0  # something dark in between
+    light, found = fit_light(colours.astype(np.float32), noisy, normals, weights, area_m2=AREA_M2)
+    true = np.log(lamps(normals[weights > 0]))
+    away = np.log(light.at(normals[weights > 0])) - true
+    assert np.abs(away - away.mean(axis=0)).mean() < 0.25 * np.abs(true - true.mean(axis=0)).mean()
+    wanted = np.log(gains[:, 0] / np.exp(np.log(gains).mean(axis=0)))
+    assert np.abs(found - wanted).mean() < 0.01
+
+
+def test_nobody_turns_and_different_cloth_is_not_taken_for_light():
+    """Front and back differ, and always face the same way: half of it may be light, but not all of it."""
+    rng = np.random.default_rng(4)
+    normals = np.repeat(turning(1, 3000, rng, 0), 4, axis=0)
+    albedo = np.where(normals[0, :, 2:] > 0, 150.0, 75.0) * np.ones(3) * rng.uniform(0.8, 1.2, (3000, 1))
+    colours = (albedo + rng.normal(0, 2, (4, 3000, 3))).astype(np.float32)
+    light, _ = fit_light(colours, normals, normals, np.ones((4, 3000), np.float32), area_m2=AREA_M2)
+    factors = light.at(np.array([[0, 0, 1.0], [0, 0, -1.0]]))
+    assert np.isfinite(factors).all()
+    assert (factors[0] / factors[1] < 150 / 75 * 1.5).all()
+
+
+def test_even_light_changes_nothing():
+    normals = np.random.default_rng(0).standard_normal((10, 3))
+    assert np.array_equal(Light.even().at(normals), np.ones((10, 3)))
+
+
+def test_harmonics_have_no_mean_over_the_sphere():
+    normals = np.random.default_rng(0).standard_normal((200_000, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    assert np.abs(harmonics(normals).mean(axis=0)).max() < 0.01
