@@ -24,6 +24,7 @@ from capture4d.app.viewer.panels import (
     verdict_strip,
 )
 from capture4d.app.viewer.presenter import Picture, Presenter
+from capture4d.app.viewer.scenery import set_scene
 from capture4d.app.viewer.surfaces import Dots
 from capture4d.app.viewer.take import SCAN
 from capture4d.app.viewer.timeline import OPEN, curve_names
@@ -59,7 +60,9 @@ class ViewerPage:
         self._handles: dict[tuple[int, str], Any] = {}
         self._marked_s = 0.0
         self._offsets = presenter.offsets_m()
-        self._set_scene()
+        boxes = [presenter.box(number) for number in range(len(presenter.takes))]
+        moved = np.stack([box + np.array([offset, 0.0, 0.0]) for box, offset in zip(boxes, self._offsets, strict=True)])
+        set_scene(server, np.stack([moved[:, 0].min(axis=0), moved[:, 1].max(axis=0)]))
         self._add_controls()
         self._threads = [threading.Thread(target=run, daemon=True) for run in (self._show_forever, self._look_forever)]
         for thread in self._threads:
@@ -207,23 +210,8 @@ class ViewerPage:
 
     # --- the page ------------------------------------------------------------------------------------------------
 
-    def _set_scene(self) -> None:
-        scene, camera = self._server.scene, self._server.initial_camera
-        scene.set_up_direction("+y")
-        scene.configure_default_lights(cast_shadow=False)
-        boxes = [self._presenter.box(number) for number in range(len(self._presenter.takes))]
-        moved = [box + np.array([offset, 0.0, 0.0]) for box, offset in zip(boxes, self._offsets, strict=True)]
-        low, high = np.min([box[0] for box in moved], axis=0), np.max([box[1] for box in moved], axis=0)
-        centre, size = (low + high) / 2, float(np.linalg.norm(high - low))
-        camera.look_at = tuple(centre.tolist())
-        camera.position = tuple((centre + size * np.array([0.35, 0.15, 1.15])).tolist())
-        camera.up = (0.0, 1.0, 0.0)
-        floor = (float(centre[0]), float(low[1]), float(centre[2]))
-        scene.add_grid("/floor", 4.0, 4.0, plane="xz", cell_size=0.25, section_size=1.0, position=floor)
-
     def _add_controls(self) -> None:
         gui, presenter = self._server.gui, self._presenter
-        gui.configure_theme(control_width="large", dark_mode=False, show_share_button=False, show_logo=False)
         names = [take.name for take in presenter.takes]
         gui.set_panel_label(" beside ".join(names))
         with gui.add_folder("time"):
@@ -335,13 +323,28 @@ class ViewerPage:
         series.append(uplot.Series(label="now", stroke="#111111", width=0, points={"show": True, "size": 9}))
         self._rows: list[np.ndarray] = []
         self._plot = gui.add_uplot(
-            self._curve_data(), tuple(series), scales={"x": uplot.Scale(time=False)}, aspect=1.6,
+            self._curve_data(), tuple(series), scales=self._scales(), aspect=1.6,
             legend=uplot.Legend(show=len(self._presenter.takes) > 1),
         )  # fmt: skip
 
         @self._measure.on_update
         def _(event: Any) -> None:
-            self._plot.data = self._curve_data()
+            self._draw_curves()
+
+    def _draw_curves(self) -> None:
+        data = self._curve_data()
+        self._plot.scales = self._scales()
+        self._plot.data = data
+
+    def _scales(self) -> dict[str, Any]:
+        """Said, for uPlot finds none among numbers that are not known."""
+        values = np.concatenate(self._rows[1:])
+        known = values[np.isfinite(values)]
+        low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
+        room = 0.05 * (high - low) or 0.05 * abs(high) or 0.5
+        ids = self._rows[0]
+        first, last = float(ids[0]), float(max(ids[-1], ids[0] + 1))
+        return {"x": {"time": False, "range": (first, last)}, "y": {"range": (low - room, high + room)}}
 
     def _measures(self) -> tuple[str, ...]:
         found = (name for timeline in self._timelines for name in curve_names(timeline))
@@ -382,7 +385,7 @@ class ViewerPage:
             self._measure.options = measures
         self._fill_list()
         self._notes.content = self._all_notes()
-        self._plot.data = self._curve_data()
+        self._draw_curves()
         if self._clock is not None:
             with self._wake:
                 self._clock = replace(self._clock, frame_ids=self._frame_ids)
