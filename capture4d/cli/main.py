@@ -24,6 +24,7 @@ from capture4d.cli.commands.drape_offsets import OffsetsPredict, OffsetsTrain
 from capture4d.cli.commands.exchange import Export, Import, Score
 from capture4d.cli.commands.files import ConvertBody, ConvertPoses, ConvertRig, RegisterMesh, Template
 from capture4d.cli.commands.folders import Diff, Status
+from capture4d.cli.commands.live import TryOn, View
 from capture4d.cli.commands.models import Animate, Fit, FitStyles
 from capture4d.cli.commands.offsets import OffsetsApply, OffsetsDraw, OffsetsEdit
 from capture4d.cli.commands.stages import Extract, Register, Report, Run, Track
@@ -60,9 +61,11 @@ COMMANDS: Mapping[str, Any] = {
     "report": Report,
     "status": Status,
     "diff": Diff,
+    "view": View,
     "fit": Fit,
     "fit-styles": FitStyles,
     "animate": Animate,
+    "tryon": TryOn,
     "wrinkles maps": WrinklesMaps,
     "wrinkles train": WrinklesTrain,
     "wrinkles apply": WrinklesApply,

@@ -91,6 +91,11 @@ class TriedGarment(Protocol):
         ...
 
     @property
+    def clip_fps(self) -> float | None:
+        """The rate that clips have to have; None where any will do."""
+        ...
+
+    @property
     def learned(self) -> PoseRange: ...
 
     @property
@@ -148,6 +153,10 @@ class LearnedTried:
     @property
     def fps(self) -> float:
         return self.model.model.fps
+
+    @property
+    def clip_fps(self) -> float | None:
+        return self.fps
 
     @property
     def learned(self) -> PoseRange:
@@ -229,7 +238,11 @@ class StyledTried:
 
     @property
     def fps(self) -> float:
-        return 30.0  # a pose alone decides: any rate will do
+        return 30.0
+
+    @property
+    def clip_fps(self) -> float | None:
+        return None  # a pose alone decides
 
     @property
     def learned(self) -> PoseRange:

@@ -1,5 +1,6 @@
 """A garment out of the body as fast as a slider moves: what `geometry.intersection_removal` does in twelve searches and
-hundreds of sweeps, in one or two searches and two steps. It keeps no edge to its length; when the pose rests, the exact removal takes over.
+hundreds of sweeps, in one or two searches and two steps. It keeps no edge to its length; when the pose rests, the exact
+removal takes over.
 """
 
 from __future__ import annotations

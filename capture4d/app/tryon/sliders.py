@@ -1,7 +1,7 @@
 """Sliders that pose a person of any skeleton: named after limbs, found by its anatomy, in degrees.
 
-A turn raises a limb to its side, swings it forwards, or turns it about itself. Its axes follow from how the limb lies in
-the rest pose, so that an arm of an A-pose and one of a T-pose are raised alike. Parts of the spine share a turn.
+A turn raises a limb to its side, swings it forwards, or turns it about itself. Its axes follow from how the limb lies
+in the rest pose, so that an arm of an A-pose and one of a T-pose are raised alike. Parts of the spine share a turn.
 """
 
 from __future__ import annotations

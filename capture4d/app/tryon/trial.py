@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from capture4d.app.tryon.garments import Fitting, TriedGarment
+from capture4d.app.tryon.session import still
 from capture4d.app.tryon.sliders import PoseSliders
-from capture4d.types import PoseSequence
 
 __all__ = ["Trial", "random_motion", "try_out"]
 
@@ -62,18 +62,6 @@ def random_motion(
         share = np.clip((now - begun) / lasts, 0.0, 1.0)
         values = start + (3 * share**2 - 2 * share**3) * (goal - start)
         yield {slider.name: float(value) for slider, value in zip(sliders.sliders, values, strict=True)}
-
-
-def still(tried: TriedGarment, rotations: np.ndarray, translation: np.ndarray, count: int) -> PoseSequence:
-    """A pose that has rested for so many frames, at the garment's rate."""
-    return PoseSequence(
-        np.repeat(rotations[None], count, axis=0).astype(np.float32),
-        np.repeat(translation[None], count, axis=0).astype(np.float32),
-        np.zeros(len(tried.body.shape_directions), np.float32),
-        np.arange(count, dtype=np.int32),
-        tried.fps,
-        tried.body.joint_names,
-    )
 
 
 def try_out(

@@ -13,7 +13,7 @@ __all__ = ["ViewConfig"]
 class ViewConfig:
     """How coarse scans are shown, and how much is kept in memory."""
 
-    preview_mm: Annotated[float, Range(least=1.0, most=100.0)] = 10.0
+    preview_mm: Annotated[float, Range(least=1.0, most=200.0)] = 10.0
     """Scans are shown with a vertex for each cube of this side."""
     memory_mb: Count = 128
     """Frames that were shown are kept ready in so much memory."""

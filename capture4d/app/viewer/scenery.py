@@ -11,7 +11,7 @@ from jaxtyping import Float64
 
 from capture4d.errors import InputError
 
-__all__ = ["VISER", "open_server", "set_scene"]
+__all__ = ["VISER", "open_server", "require_viser", "set_scene"]
 
 VISER = ("viser", "view")
 """What is imported, and the extra of this project that installs it."""
@@ -20,9 +20,8 @@ _LIGHTS = {"key": ((1.2, 2.0, 2.4), 2.4), "fill": ((-2.2, 0.6, 1.6), 0.9), "back
 _AMBIENT = 0.9
 
 
-def open_server(host: str, port: int, title: str) -> Any:
-    """A `viser.ViserServer`; untyped, for viser may be absent.
-
+def require_viser() -> None:
+    """
     Raises:
         InputError: viser is not installed; says how it is.
     """
@@ -30,6 +29,15 @@ def open_server(host: str, port: int, title: str) -> Any:
         raise InputError(
             f"expected the Python package '{VISER[0]}', found none; run: pip install 'capture4d[{VISER[1]}]'"
         )
+
+
+def open_server(host: str, port: int, title: str) -> Any:
+    """A `viser.ViserServer`; untyped, for viser may be absent.
+
+    Raises:
+        InputError: viser is not installed; says how it is.
+    """
+    require_viser()
     viser = importlib.import_module(VISER[0])
     server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
     server.gui.configure_theme(control_width="large", dark_mode=False, show_share_button=False, show_logo=False)
@@ -46,7 +54,7 @@ def set_scene(server: Any, box: Float64[np.ndarray, "2 3"]) -> None:
     scene.add_light_ambient("/light/ambient", intensity=_AMBIENT)
     for name, (place, strength) in _LIGHTS.items():
         where = tuple((centre + np.array(place)).tolist())
-        scene.add_light_directional(f"/light/{name}", intensity=strength, position=where)
+        scene.add_light_point(f"/light/{name}", intensity=strength, decay=0.0, position=where)
     floor = (float(centre[0]), float(low[1]), float(centre[2]))
     scene.add_grid("/floor", 4.0, 4.0, plane="xz", cell_size=0.25, section_size=1.0, position=floor)
     camera.look_at = tuple(centre.tolist())

@@ -1,7 +1,8 @@
 """What the browser is sent: a surface as a small glTF file, smooth, coloured or with a normal map.
 
-Positions and normals are whole numbers (KHR_mesh_quantization, which three.js reads), so that a frame is half as large:
-positions of 16 bits over the longest side of the surface, 0.03 mm for a person, normals of 8, half a degree.
+Positions are whole numbers of 16 bits over the longest side of the surface (KHR_mesh_quantization, which three.js
+reads): steps of 0.03 mm for a person. Normals are floats, for viser shades those of 8 bits as if each were along an
+axis.
 
 References: glTF 2.0 specification; KHR_mesh_quantization.
 """
@@ -22,7 +23,7 @@ from capture4d.types import Mesh
 
 __all__ = ["Dots", "Shown", "Surface", "corner_vertices", "surface_glb"]
 
-_TYPES = {"f4": 5126, "u4": 5125, "u2": 5123, "u1": 5121, "i1": 5120}
+_TYPES = {"f4": 5126, "u4": 5125, "u2": 5123, "u1": 5121}
 _ARRAY, _INDICES = 34962, 34963
 _LINEAR, _MIPMAPS, _CLAMP = 9729, 9987, 33071
 _TABLE = np.rint(65535 * linear_colours(np.arange(256.0))).astype("<u2")
@@ -107,10 +108,10 @@ def surface_glb(surface: Surface, corners: Corners | None = None) -> bytes:
         size = max(float(np.ptp(mesh.vertices, axis=0).max()), 1e-6)
         places = np.rint((mesh.vertices - low) * (65535 / size)).astype("<u2")[vertex]
         ends = {"min": places.min(axis=0).tolist(), "max": places.max(axis=0).tolist()}
-        normals = np.rint(127 * vertex_normals(mesh.vertices, mesh.faces)).astype("i1")[vertex]
+        normals = vertex_normals(mesh.vertices, mesh.faces).astype("<f4")[vertex]
         attributes = {
             "POSITION": add(_padded(places, 4), "VEC3", normalized=True, **ends),
-            "NORMAL": add(_padded(normals, 4), "VEC3", normalized=True),
+            "NORMAL": add(normals, "VEC3"),
         }
         if not isinstance(surface.colours, tuple):
             light = np.full((len(mesh.vertices), 4), 65535, "<u2")
