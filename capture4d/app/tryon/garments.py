@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64
@@ -40,6 +40,7 @@ MARGIN_M = 0.003
 """How far over the skin cloth is pushed while it moves: between a frame's two searches its feet wander a little."""
 
 
+@runtime_checkable
 class WornLive(Protocol):
     """A garment on one person. Poses are asked in the order of a motion, frame by frame at the garment's rate."""
 
@@ -73,6 +74,7 @@ class WornLive(Protocol):
         ...
 
 
+@runtime_checkable
 class TriedGarment(Protocol):
     """A model, ready to be put on somebody."""
 

@@ -13,6 +13,7 @@ import numpy as np
 from capture4d.app.drawing.palette import SKIN
 from capture4d.app.tryon.config import TryOnConfig
 from capture4d.app.tryon.session import CLOTH, LiveFrame, Session
+from capture4d.app.tryon.sliders import PoseSlider
 from capture4d.app.viewer.scenery import set_scene
 from capture4d.app.viewer.surfaces import surface_glb
 from capture4d.errors import InputError
@@ -205,7 +206,7 @@ class TryOnPage:
         begun = time.monotonic()
         session = self._session
         if session.clip is None:
-            session.pose({name: float(each.value) for name, each in self._turns.items() if each.value})
+            session.pose({slider.name: self._degrees(slider) for slider in session.sliders.sliders})
             frame = session.moving()
         else:
             if self._playing:
@@ -221,6 +222,10 @@ class TryOnPage:
             self._said.content = f"moving: {self.moving_hz:.0f} frames a second"
         slowest = self._config.most_hz if session.clip is None else min(self._config.most_hz, session.clip.fps)
         time.sleep(max(0.0, 1 / slowest - took))
+
+    def _degrees(self, slider: PoseSlider) -> float:
+        """Within its range, which numbers that are typed may leave."""
+        return min(max(float(self._turns[slider.name].value), slider.low), slider.high)
 
     def _rest(self) -> None:
         frame = self._session.resting(self._row)

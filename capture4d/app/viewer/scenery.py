@@ -15,9 +15,11 @@ __all__ = ["VISER", "open_server", "require_viser", "set_scene"]
 
 VISER = ("viser", "view")
 """What is imported, and the extra of this project that installs it."""
-_LIGHTS = {"key": ((1.2, 2.0, 2.4), 2.4), "fill": ((-2.2, 0.6, 1.6), 0.9), "back": ((0.4, 1.6, -2.4), 1.3)}
+_LIGHTS = {"key": ((1.2, 2.0, 2.4), 1.6), "fill": ((-2.2, 0.6, 1.6), 0.5), "back": ((0.4, 1.6, -2.4), 0.9)}
 """Where lights stand, metres from the subject, and how strong they are."""
-_AMBIENT = 0.9
+_AMBIENT = 0.5
+_ASIDE = np.array([0.16, 0.0, 0.0])
+"""The camera looks so far, of the diagonal of the box, past it: the controls lie over the right of the page."""
 
 
 def require_viser() -> None:
@@ -57,6 +59,7 @@ def set_scene(server: Any, box: Float64[np.ndarray, "2 3"]) -> None:
         scene.add_light_point(f"/light/{name}", intensity=strength, decay=0.0, position=where)
     floor = (float(centre[0]), float(low[1]), float(centre[2]))
     scene.add_grid("/floor", 4.0, 4.0, plane="xz", cell_size=0.25, section_size=1.0, position=floor)
-    camera.look_at = tuple(centre.tolist())
-    camera.position = tuple((centre + size * np.array([0.3, 0.15, 1.05])).tolist())
+    aside = centre + size * _ASIDE
+    camera.look_at = tuple(aside.tolist())
+    camera.position = tuple((aside + size * np.array([0.3, 0.15, 1.05])).tolist())
     camera.up = (0.0, 1.0, 0.0)

@@ -26,7 +26,7 @@ __all__ = ["Dots", "Shown", "Surface", "corner_vertices", "surface_glb"]
 _TYPES = {"f4": 5126, "u4": 5125, "u2": 5123, "u1": 5121}
 _ARRAY, _INDICES = 34962, 34963
 _LINEAR, _MIPMAPS, _CLAMP = 9729, 9987, 33071
-_TABLE = np.rint(65535 * linear_colours(np.arange(256.0))).astype("<u2")
+_TABLE = np.rint(65535 * linear_colours(np.repeat(np.arange(256.0)[:, None], 3, axis=1))[:, 0]).astype("<u2")
 """glTF's COLOR_0 is linear light; 16 bits tell all sRGB bytes apart."""
 
 
@@ -143,7 +143,7 @@ def _padded(rows: np.ndarray, count: int) -> np.ndarray:
 def _material(surface: Surface) -> dict[str, Any]:
     light = [1.0, 1.0, 1.0]
     if isinstance(surface.colours, tuple):
-        light = linear_colours(np.array(surface.colours, float)).tolist()
+        light = linear_colours(np.array([surface.colours], float))[0].tolist()
     base = {"baseColorFactor": [*light, surface.opacity], "metallicFactor": 0.0, "roughnessFactor": 0.9}
     material: dict[str, Any] = {"doubleSided": True, "pbrMetallicRoughness": base}
     return material | ({"alphaMode": "BLEND"} if surface.opacity < 1 else {})
