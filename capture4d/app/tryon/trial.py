@@ -7,7 +7,7 @@ long; a third of them move at a time. So do those of shape and style if asked, f
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -70,14 +70,17 @@ def try_out(
     rng: np.random.Generator,
     *,
     rest_every_s: float = 2.0,
+    beta: Sequence[float] | None = None,
     style: Mapping[str, float] | None = None,
 ) -> Trial:
     """Move the sliders for so long, at the garment's rate or at least 30 frames a second; rest now and then.
 
     Args:
         rest_every_s: after so long the exact removal is made, and the sliders go on from there.
+        beta, style: who wears it, and in which style; by default who does so at first.
     """
-    sliders, fitting = PoseSliders.of(tried.body), Fitting(tried, tried.first_shape, style or {})
+    sliders = PoseSliders.of(tried.body)
+    fitting = Fitting(tried, tried.first_shape if beta is None else beta, style or {})
     fps, nowhere = max(tried.fps, 30.0), np.zeros(3, np.float32)
     frames = max(int(seconds * fps), 1)
     took, inside, overlapping, depths = [], [], [], []

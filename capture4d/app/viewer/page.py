@@ -28,6 +28,7 @@ from capture4d.app.viewer.scenery import set_scene
 from capture4d.app.viewer.surfaces import Dots
 from capture4d.app.viewer.take import SCAN
 from capture4d.app.viewer.timeline import OPEN, curve_names
+from capture4d.errors import InputError
 
 __all__ = ["ViewerPage"]
 
@@ -56,6 +57,7 @@ class ViewerPage:
         self._frame = self._frame_ids[0]
         self._clock: Clock | None = None
         self._wake, self._closed, self._stale = threading.Condition(), False, True
+        self._sending = False
         self._shown_seconds: list[float] = []
         self._handles: dict[tuple[int, str], Any] = {}
         self._marked_s = 0.0
@@ -90,7 +92,7 @@ class ViewerPage:
         ends = time.monotonic() + timeout_s
         while time.monotonic() < ends:
             with self._wake:
-                if not self._stale:
+                if not self._stale and not self._sending:
                     return True
             time.sleep(0.005)
         return False
@@ -149,9 +151,10 @@ class ViewerPage:
                         self._wake.wait(timeout=1 / MOST_SHOWN_HZ / 2)
                         continue
                     self._frame = due
-                frame, self._stale = self._frame, False
+                frame, self._stale, self._sending = self._frame, False, True
             begun = time.monotonic()
             self._send(self._presenter.picture(frame, choice))
+            self._sending = False
             self._shown_seconds = [*self._shown_seconds[-99:], time.monotonic() - begun]
             if clock is not None:
                 for ahead in clock.next_frames(frame, AHEAD):
@@ -167,8 +170,11 @@ class ViewerPage:
             with self._wake:
                 if self._wake.wait_for(lambda: self._closed, timeout=self._every_s):
                     return
-            if self._presenter.look():
-                self._renew()
+            try:
+                if self._presenter.look():
+                    self._renew()
+            except (InputError, OSError) as error:  # a folder that is gone, or is being replaced
+                self._faults.content = f"⚠ {error}"
 
     # --- what is sent --------------------------------------------------------------------------------------------
 

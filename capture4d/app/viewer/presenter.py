@@ -101,12 +101,19 @@ class Presenter:
                 except (InputError, OSError) as error:
                     payloads[number, layer] = None
                     faults.append(str(error))
+                except (IndexError, KeyError, ValueError):  # files of two templates, while one replaces the other
+                    payloads[number, layer] = None
+                    faults.append(f"{take.name}: {layer} of frame {frame_id} is being written anew")
         return Picture(frame_id, payloads, tuple(faults))
 
     def _key(self, number: int, layer: str, frame_id: int, choice: Choice, paint: str) -> tuple:
         state = self.takes[number].state(layer, frame_id)
         coloured = (paint, choice.high) if layer == CLOTH_LAYER else ()
         return (number, layer, frame_id, state, layer == SCAN and choice.full, *coloured)
+
+    def forget(self) -> None:
+        """Keep nothing of what was made."""
+        self._kept.clear()
 
     def offsets_m(self) -> list[float]:
         """How far each take is moved along x, so that they stand side by side."""
