@@ -263,7 +263,7 @@ class TryOnPage:
             self._written.content = f"writing {folder} …"
             result = self._session.export(folder)
             self._written.content = (
-                f"written: {folder}, {result.frames} frames; `capture4d export {folder}` hands it on"
+                f"{result.frames} frames in {folder}; `capture4d export {folder}` hands them on"
             )
         except (InputError, OSError) as error:
             self._written.content = f"⚠ {error}"
