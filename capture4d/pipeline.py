@@ -56,10 +56,10 @@ if TYPE_CHECKING:
     from retarget.animation.stage import Wearer
 
 __all__ = [
-    "animate", "calibrate", "check", "check_rig", "compare", "diff", "export", "export_onnx", "extract", "fit", "fit_style",
-    "fit_styles", "import_meshes", "offsets_apply", "offsets_draw", "offsets_edit", "offsets_predict", "offsets_train",
-    "register", "register_mesh", "report", "run", "scan", "score", "status", "synth", "synth_board", "synth_drapes",
-    "template", "texture", "track", "wrinkles_apply", "wrinkles_maps", "wrinkles_offsets", "wrinkles_train",
+    "animate", "calibrate", "check", "check_rig", "compare", "diff", "export", "export_onnx", "extract", "fit",
+    "fit_style", "fit_styles", "import_meshes", "offsets_apply", "offsets_draw", "offsets_edit", "offsets_predict",
+    "offsets_train", "register", "register_mesh", "report", "run", "scan", "score", "status", "synth", "synth_board",
+    "synth_drapes", "template", "texture", "track", "wrinkles_apply", "wrinkles_maps", "wrinkles_offsets", "wrinkles_train",
 ]  # fmt: skip
 
 

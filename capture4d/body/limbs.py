@@ -129,13 +129,14 @@ class LimbSurfaces:
         self._worn, self._start, self._at = worn, start, start
         self._vertices = np.ascontiguousarray(vertices, np.float64)
         self._normals = vertex_normals(self._vertices, worn.faces)
-        self._others: list[tuple[np.ndarray, TriangleScene, np.ndarray, np.ndarray]] = []
+        self._others: list[tuple[int, np.ndarray, np.ndarray, np.ndarray]] = []
+        self._scenes: dict[int, TriangleScene] = {}
         for limb, faces in enumerate(worn.limbs):
             strangers = np.flatnonzero(~worn.carried[:, limb])
             if len(faces) and len(strangers):
                 corners = self._vertices[faces.reshape(-1)]
                 box = corners.min(axis=0) - REACH_M, corners.max(axis=0) + REACH_M
-                self._others.append((strangers, TriangleScene((self._vertices, faces)), *box))
+                self._others.append((limb, strangers, *box))
 
     def heights(
         self, points: Float[np.ndarray, "points 3"], vertices: Int32[np.ndarray, " points"]
@@ -153,20 +154,26 @@ class LimbSurfaces:
         far = heights > LEAVING_M / 2
         outwards = np.where(far[:, None], (points - feet) / np.maximum(heights, LEAVING_M / 2)[:, None], normals)
         room, overlapping = np.full(len(points), np.inf), np.zeros(len(points), bool)
-        for strangers, scene, low, high in self._others:
+        for limb, strangers, low, high in self._others:
             ends = feet[strangers], points[strangers]
             near = (np.maximum(*ends) > low).all(axis=1) & (np.minimum(*ends) < high).all(axis=1)
             chosen = strangers[near]
             if not len(chosen):
                 continue
             away = outwards[chosen]
-            hits = scene.cast(np.hstack([feet[chosen] + LEAVING_M * away, away]))
+            hits = self._scene(limb).cast(np.hstack([feet[chosen] + LEAVING_M * away, away]))
             facing = np.einsum("px,px->p", hits.normals, away)
             met = np.isfinite(hits.distance)
             overlapping[chosen] |= met & (facing > 0)
             distance = np.where(met & (facing < 0), hits.distance + LEAVING_M, np.inf)
             room[chosen] = np.minimum(room[chosen], distance)
         return Contacts(heights, normals, feet, outwards, room, overlapping)
+
+    def _scene(self, limb: int) -> TriangleScene:
+        """A limb that rays are sent against; made when the garment first comes near it."""
+        if limb not in self._scenes:
+            self._scenes[limb] = TriangleScene((self._vertices, self._worn.limbs[limb]))
+        return self._scenes[limb]
 
     def _over(self, points: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Heights, normals, nearest points and their faces, walking from some faces."""

@@ -20,10 +20,10 @@ _SHARED = (StageOptions, ClusterOptions, GradedOptions, ProgressOptions, MeshOpt
 """Whose options many commands have, in the order in which they are listed; help is nobody's."""
 _GROUPS: Mapping[str, Sequence[str]] = {
     "from scans to a registered garment:": (
-        "run", "check", "template", "extract", "track", "register", "report", "status", "diff",
+        "run", "check", "template", "extract", "track", "register", "report", "status", "diff", "view",
     ),
     "learn and animate:": (
-        "fit", "fit-styles", "fit-style", "animate", "wrinkles maps", "wrinkles train", "wrinkles apply",
+        "fit", "fit-styles", "fit-style", "animate", "tryon", "wrinkles maps", "wrinkles train", "wrinkles apply",
         "wrinkles offsets", "compare", "offsets train", "offsets predict", "offsets draw", "offsets edit",
         "offsets apply",
     ),
@@ -66,6 +66,7 @@ EXAMPLES: Mapping[str, Sequence[str]] = {
     "report": ("report work", "report work --fail-above fit_mean_mm=1.0 --fail-above frames_failed=0"),
     "status": ("status work", "status work --json"),
     "diff": ("diff before after", "diff before after --fail-if-worse fit_mean_mm=5"),
+    "view": ("view work", "view capture", "view work --beside before --prepare"),
     "fit": ("fit work", "fit walk run jump --output shirt"),
     "fit-styles": ("fit-styles styles --output model", "fit-styles styles --output model --preset paper"),
     "fit-style": ("fit-style model work --output style.json",),
@@ -74,6 +75,7 @@ EXAMPLES: Mapping[str, Sequence[str]] = {
         "animate model --poses motion.bvh --output dance --style length=0.7",
         "animate model --poses motion.bvh --output dance --style @style.json",
     ),
+    "tryon": ("tryon work --poses dance.bvh", "tryon model --wrinkles network"),
     "wrinkles maps": ("wrinkles maps work",),
     "wrinkles train": ("wrinkles train work --output model",),
     "wrinkles apply": ("wrinkles apply model work --bits 8 --flip-green",),

@@ -35,6 +35,7 @@ OPTIONAL = {
     "alembic3d": "`export --format abc`",
     "meshmonk": "a peer of `python -m benchmarks registration`",
     "usd-core": "`export --format usd`",
+    "viser": "`view` and `tryon`",
 }
 """Distributions that something is better with, and what."""
 CUDA = "`--device cuda` of fit and animate"

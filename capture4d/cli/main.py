@@ -24,6 +24,7 @@ from capture4d.cli.commands.drape_offsets import OffsetsPredict, OffsetsTrain
 from capture4d.cli.commands.exchange import Export, ExportOnnx, Import, Score, Texture
 from capture4d.cli.commands.files import ConvertBody, ConvertPoses, ConvertRig, RegisterMesh, Template
 from capture4d.cli.commands.folders import Diff, Status
+from capture4d.cli.commands.live import TryOn, View
 from capture4d.cli.commands.models import Animate, Fit, FitStyle, FitStyles
 from capture4d.cli.commands.offsets import OffsetsApply, OffsetsDraw, OffsetsEdit
 from capture4d.cli.commands.stages import Extract, Register, Report, Run, Track
@@ -60,10 +61,12 @@ COMMANDS: Mapping[str, Any] = {
     "report": Report,
     "status": Status,
     "diff": Diff,
+    "view": View,
     "fit": Fit,
     "fit-styles": FitStyles,
     "fit-style": FitStyle,
     "animate": Animate,
+    "tryon": TryOn,
     "wrinkles maps": WrinklesMaps,
     "wrinkles train": WrinklesTrain,
     "wrinkles apply": WrinklesApply,
