@@ -37,7 +37,6 @@ def approach(
     start: Float64[np.ndarray, "verts 3"],
     config: ApproachConfig,
     *,
-    first_width: float | None = None,
     signatures: tuple[Float64[np.ndarray, "verts q"], Float64[np.ndarray, "points q"]] | None = None,
     landmarks: tuple[Int64[np.ndarray, " marks"], Float64[np.ndarray, "marks 3"]] | None = None,
 ) -> Float64[np.ndarray, "verts 3"]:
@@ -45,7 +44,6 @@ def approach(
 
     Args:
         start: where the template lies, metres.
-        first_width: of the Gaussian, in place of the configured ones, metres.
         signatures: of the template's vertices and of the scan's points, metres.
         landmarks: template vertices, and their places on the scan, metres.
     """
@@ -67,7 +65,7 @@ def approach(
     pair_start = edge_vectors(start[graph.nodes], pairs)
     lengths = np.linalg.norm(edge_vectors(analysis.rest[graph.nodes], pairs), axis=1)
     first = config.width[0] if signatures is None else config.signature_width
-    width = (first_width or first, config.width[1])
+    width = (first, config.width[1])
     vertices = start
     for step in range(config.steps):
         at = (step, config.steps)

@@ -14,7 +14,7 @@ the scan get finer; the paper gives its weights without units and says "triangle
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import field
+from dataclasses import field, replace
 from typing import Annotated, Literal
 
 from capture4d.settings import Cosine, Count, NonNegative, Percent, Positive, Range, Share, Whole, settings
@@ -342,7 +342,7 @@ class ApproachConfig:
     width: tuple[Positive, Positive] = (0.06, 0.012)
     """Standard deviation of the Gaussian by which a scan point divides its vote, metres, first and last step."""
     wider: Positive = 0.1
-    """The same in the first step of a second attempt, where the first has failed."""
+    """The same in the first step where signatures have failed."""
     normal: NonNegative = 3.0
     """How much less a vertex counts whose normal turns away: exp(-normal (1 - cosine))."""
     reach: Positive = 3.5
@@ -351,6 +351,10 @@ class ApproachConfig:
     """Standard deviation of geodesic signatures between scan and template, metres."""
     signature_weight: tuple[NonNegative, NonNegative] = (1.0, 0.02)
     """Weight of the signatures in the votes, beside 1 of the distance, first and last step."""
+    again_weight: Positive = 0.3
+    """The same in the first step of a second attempt, from where the first has led."""
+    again_width: Positive = 0.06
+    """First width of the Gaussian there."""
     signature_width: Positive = 0.15
     """First width of the Gaussian where signatures tell which vertices a scan point may vote for: a limb may swing by
     several of these."""
@@ -376,6 +380,17 @@ class ApproachConfig:
     voters: Count = 2000
     """Scan points that vote."""
 
+    @property
+    def again(self) -> ApproachConfig:
+        """A second attempt, from where the first has led."""
+        weight = (self.again_weight, self.signature_weight[1])
+        return replace(self, signature_width=self.again_width, signature_weight=weight)
+
+    @property
+    def wide(self) -> ApproachConfig:
+        """An attempt by nearness alone, from farther."""
+        return replace(self, width=(self.wider, self.width[1]))
+
 
 @settings
 class ScanFitConfig:
@@ -392,7 +407,7 @@ class ScanFitConfig:
     beyond_check_percent: Percent = 3.0
     """Share of the scan beyond the template's open borders above which the result is to be checked: the scan shows more
     than the template, or the template has not slid there."""
-    lost_check_percent: Percent = 5.0
+    lost_check_percent: Percent = 2.0
     """Share of the template farther than `far_fail_mm` from the scan above which the result is to be checked: what is
     not scanned follows its neighbours, and swings as they do."""
     lost_fail_percent: Percent = 5.0

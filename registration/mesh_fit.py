@@ -6,8 +6,10 @@ In this order, until the scan is reached:
                where limbs of the scan are out of reach
     far        drawn there as a whole first (`approach`), settled in its shape (`settle`), limbs that turned about
                themselves turned back (`untwisted`), then vertex by vertex
+    again      once more from there, narrowly, where that lost a part: two hands close to each other both go to the
+               middle at first
 
-Where `align` may, and a rigid motion brings the template far nearer, both are tried from there as well; from there
+Where `align` may, and a rigid motion brings the template far nearer, these are tried from there as well; from there
 alone if nothing of the scan lies near the start. Then:
 
     wide       the same with wider votes, where limbs had to swing
@@ -31,7 +33,7 @@ from capture4d.errors import InputError
 from capture4d.types import Garment, GarmentScan
 from registration.alignment import align, fit_similarity
 from registration.approach import approach, spread_evenly
-from registration.config import MeshRegistrationConfig, RegistrationConfig, ScanFitConfig
+from registration.config import ApproachConfig, MeshRegistrationConfig, RegistrationConfig, ScanFitConfig
 from registration.correspondences import mesh_normals
 from registration.geodesic_signature import Likeness, geodesic_signatures, likeness
 from registration.limb_twist import untwisted
@@ -51,7 +53,7 @@ NORMAL_LENGTH = 0.03
 FARTHEST = 0.1
 """Beyond this, metres, one is as far off as another."""
 SAMPLES = 4000
-LIMB_AWAY, AWAY_SHARE = 0.06, 0.1
+LIMB_AWAY, AWAY_SHARE = 0.06, 0.03
 """Where more than this share of the scan is farther than this from the template, metres, the way from nearby is tried
 after the one from afar, if at all."""
 BETTER = 0.8
@@ -68,8 +70,12 @@ OTHER_GAP = 0.03
 """Mean difference of signatures, metres, up to which the scan may show another of the template's kind."""
 MOST_LOST = 0.2
 """Share of the template that may be far from a scan of another size; of half a person it is half."""
+PART_LOST = 0.01
+"""Share of the template away from the scan by which a hand may be lost: the way from afar is tried as well."""
 BORDER_MM = 5.0
 """Mean distance of the template's open borders from the scan above which it does not end where the scan does."""
+FROM_AFAR = ("far", "again", "wide")
+"""Ways by `approach`."""
 FREE = ("sized", "soft")
 """Ways that keep no lengths."""
 LEAST_MARKS = 3
@@ -86,7 +92,7 @@ class MeshFit:
     analysis: TemplateAnalysis
     scan: FrameScan
     way: str
-    """near, far, wide, sized, or soft."""
+    """near, far, again, wide, sized, or soft."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -155,6 +161,13 @@ class _Attempts:
         return any(attempt.reached for attempt in self.made)
 
     @property
+    def has_lost_a_part(self) -> bool:
+        """Whether a part of the template lies away from a scan that is reached: the scan's own hand is smooth enough to
+        be covered by a wrist. Or the scan lacks that part."""
+        away = 1e3 * self.scan.surface.grid.query(self.best.fit.vertices)[0]
+        return float((away > self.config.scan_fit.far_fail_mm).mean()) > PART_LOST
+
+    @property
     def of_doubtful_size(self) -> bool:
         """Whether most of the template is on the scan, which is not reached, or from afar alone: limbs of another
         person's size can be folded up to lie on it. Half a person is no smaller one."""
@@ -167,7 +180,7 @@ class _Attempts:
     def swung(self) -> bool:
         """Whether the way from afar was needed: then the start is no start for others either."""
         near = [attempt.misfit for attempt in self.made if attempt.fit.way == "near"]
-        others = [attempt.misfit for attempt in self.made if attempt.fit.way in ("far", "wide")]
+        others = [attempt.misfit for attempt in self.made if attempt.fit.way in FROM_AFAR]
         return bool(others) and min(others) < SWUNG * min(near, default=np.inf)
 
     @property
@@ -221,16 +234,20 @@ def _keeping_lengths(tried: _Attempts, start: np.ndarray, landmarks: Landmarks |
     def near(begin: np.ndarray) -> bool:
         return tried.add("near", begin, lambda: register_frame(analysis, scan, begin, config=own).vertices)
 
-    def drawn(begin: np.ndarray, width: float | None, told: Signatures | None) -> np.ndarray:
-        there = approach(
-            analysis, scan.surface, begin, config.approach, first_width=width, signatures=told, landmarks=landmarks
-        )
+    def drawn(begin: np.ndarray, votes: ApproachConfig, told: Signatures | None) -> np.ndarray:
+        there = approach(analysis, scan.surface, begin, votes, signatures=told, landmarks=landmarks)
         settled = _settled(tried, there)
         polish = replace(own, dense=replace(own.dense, cold=config.settle.polish))
         return register_frame(analysis, scan, settled, config=_dense_alone(polish)).vertices
 
     def far(begin: np.ndarray) -> bool:
-        return tried.add("far", begin, lambda: drawn(begin, None, tried.signatures))
+        told = tried.signatures
+        if tried.add("far", begin, lambda: drawn(begin, config.approach, told)):
+            return True
+        if told is None or tried.made[-1].fit.way != "far":
+            return False
+        reached = tried.made[-1].fit.vertices
+        return tried.add("again", begin, lambda: drawn(reached, config.approach.again, told))
 
     movable = config.align == "auto" and landmarks is None
     if config.lengths == "free":
@@ -239,6 +256,8 @@ def _keeping_lengths(tried: _Attempts, start: np.ndarray, landmarks: Landmarks |
     if swinging and far(start):
         return start
     if landmarks is None and near(start):
+        if tried.has_lost_a_part:
+            far(start)
         return start
     elsewhere = tried.fault is not None
     moved = _moved_there(start, scan) if movable and elsewhere else start
@@ -252,7 +271,7 @@ def _keeping_lengths(tried: _Attempts, start: np.ndarray, landmarks: Landmarks |
         return moved
     if tried.swung:
         start = tried.best.fit.start
-        tried.add("wide", start, lambda: drawn(start, config.approach.wider, None))
+        tried.add("wide", start, lambda: drawn(start, config.approach.wide, None))
         return start
     return moved
 
