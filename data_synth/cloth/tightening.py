@@ -32,8 +32,10 @@ def flatten(x, hinges, weights, bend, forward):
 
 @njit(cache=True, fastmath=True, nogil=True)
 def lengthen(x, edges, lengths, gain, slack, forward):
-    """One sweep over the edges, (E, 2): the ends of each go by the gain, a half for all of it, towards its length; those
-    of one that is too long by the share `slack` of that."""
+    """One sweep over the edges, (E, 2): the ends of each go by the gain, a half for all of it, towards its length.
+
+    Those of one that is too long go by the share `slack` of that.
+    """
     one = np.float32(1)
     for q in range(len(edges)):
         e = q if forward else len(edges) - 1 - q

@@ -15,7 +15,7 @@ from capture4d.errors import InputError
 from capture4d.geometry.ray_casting import TriangleScene
 from data_synth.cloth.patterns import mesh_pattern
 from data_synth.cloth.tshirt import tshirt_pattern
-from data_synth.config import PRESETS, TRAINING_SETS, MotionConfig, RelaxationConfig, SynthConfig
+from data_synth.config import PRESETS, TRAINING_SETS, MotionConfig, RelaxationConfig, SynthConfig, folded
 from data_synth.take import in_view, plan_take, simulate_take
 from data_synth.worn import draft, dressing_pose, put_on, template_weights
 
@@ -129,3 +129,18 @@ def _trunk_weights(points: np.ndarray, body) -> np.ndarray:
     skin_weights = body.shaped.body.skin_weights
     near = np.linalg.norm(points[:, None] - body.vertices()[None], axis=2).argmin(axis=1)
     return skin_weights[near]
+
+
+def test_folds_here_and_there_remember_by_time_and_not_by_captured_frame() -> None:
+    small = folded(replace(PRESETS["tiny"], frames=2, relaxation=RelaxationConfig(vertices=2000)))
+    for every in (1, 4):
+        levels = plan_take(replace(small, capture_every=every)).levels
+        assert [level.config.warm_start for level in levels] == pytest.approx([0.945**every] * 2)
+    even = plan_take(replace(small, folds=None, capture_every=4)).levels
+    assert [level.config.warm_start for level in even] == [0.945]
+
+
+def test_the_preset_that_folds_here_and_there_is_the_large_one_in_the_other_look() -> None:
+    large = PRESETS["tshirt-200k"]
+    assert PRESETS["tshirt-folds-200k"] == folded(replace(large, name="tshirt-folds-200k"))
+    assert PRESETS["tshirt-folds-200k"].simulation.vertices < large.simulation.vertices

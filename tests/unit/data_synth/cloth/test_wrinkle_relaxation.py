@@ -100,6 +100,18 @@ def test_the_last_sweeps_give_cloth_its_lengths_back_sooner_over_relaxed(sheets)
     assert shortest[0] < shortest[1] < shortest[2] < 1.0
 
 
+def test_cloth_that_is_pulled_along_does_not_shrink_across_where_long_edges_have_slack(sheets) -> None:
+    coarse, fine, wrinkles = sheets
+    pulled = flat(coarse) * np.array([1, 1.08, 1])
+    least = []
+    for slack in (1.0, 0.3):
+        level = Level(wrinkles, Fabric(), RelaxationConfig(radius_m=0.004), Finish(60, 0.002, 1.5, slack))
+        relaxed, _ = relax_frame(level, pulled, FAR, None)
+        least.append(np.percentile(principal_stretches(fine, relaxed)[:, 0], 5))
+    assert least[0] < 0.975, "a net of springs shrinks across by a third of what it is stretched along"
+    assert least[1] > least[0] + 0.004
+
+
 def test_a_turned_layer_stands_out_and_is_not_compressed_by_it(person: ShapedBody, sheets) -> None:
     """1 mm outwards of a fold is 5 % of its length where it is bent by a radius of 20 mm."""
     coarse, fine, wrinkles = sheets
