@@ -94,7 +94,7 @@ def _write_work(work: Path, frames: int, seed: int) -> None:
     """A work folder as `animate` leaves one."""
     body, rng = load_anny(), np.random.default_rng(seed)
     pipeline.template(None, work / "template.npz", TemplateConfig(region="tshirt"))
-    garment = _finer(load_garment(work / "template.npz"))
+    garment = finer(load_garment(work / "template.npz"))
     poses = _poses(body, frames, rng)
     (work / "body").mkdir()
     save_body(work / "body" / "body.npz", body)
@@ -115,7 +115,7 @@ def _write_work(work: Path, frames: int, seed: int) -> None:
     stage.finish([stage.path / "vertices.npy"])
 
 
-def _finer(garment: Garment) -> Garment:
+def finer(garment: Garment) -> Garment:
     """Each face cut into four at the middles of its sides."""
     mesh, weights = garment.template, garment.skin_weights
     assert weights is not None

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.random_models import garment_model
 from capture4d.app.onnx_models import stage
 from capture4d.app.onnx_models.config import OnnxConfig
 from capture4d.app.onnx_models.garments import garment_graph, styled_graph
@@ -18,21 +19,15 @@ from capture4d.body.skinning import skin, with_pose
 from capture4d.errors import InputError
 from capture4d.learning.networks import perceptron
 from capture4d.mesh_files.animated.optional_packages import ONNX, ONNX_RUNTIME, is_installed, package_module
-from capture4d.types import BlendshapeModel, Garment
-from retarget.animation.garment_model import GarmentModel
-from retarget.config import AnimateConfig, ControlConfig, LstmConfig
+from capture4d.types import Garment
+from retarget.config import AnimateConfig, LstmConfig
 from retarget.mixture.heads import Head, PoseNumbers
 from retarget.mixture.kernel_ridge import KernelRidge
 from retarget.mixture.predictors import Ensemble, Mixture
 from retarget.mixture.styled_garment import Canonical, StyledGarment
-from retarget.regression.controls import ControlLayout
-from retarget.regression.kernel import KernelRegressor
-from retarget.regression.known_range import CoefficientRange, ControlRange, KnownRange, PoseRange
-from retarget.regression.linear import LinearRegressor
-from retarget.regression.lstm import EncoderDecoder, LstmRegressor
-from retarget.regression.regressors import Scales, Trust
+from retarget.regression.known_range import PoseRange
 from retarget.shapes.blendshapes import reconstruct
-from tests.moving_garment import NAMES, cloth, limb, motion, weights
+from tests.moving_garment import cloth, limb, motion, weights
 from tests.moving_wrinkles import write_wrinkle_model
 from wrinkles.normal_maps.config import NetworkConfig
 from wrinkles.normal_maps.inference import load_model
@@ -40,7 +35,7 @@ from wrinkles.normal_maps.inference import load_model
 pytestmark = pytest.mark.skipif(
     not (is_installed(ONNX) and is_installed(ONNX_RUNTIME)), reason="the extra [onnx] is not installed"
 )
-SHAPES, FPS = 5, 25.0
+FPS = 25.0
 
 
 def answers(graph: Graph, inputs: dict[str, np.ndarray]) -> list[np.ndarray]:
@@ -84,52 +79,11 @@ def bound() -> Garment:
 # --- learned garments --------------------------------------------------------------------------------------------
 
 
-def garment_model(rng: np.random.Generator) -> GarmentModel:
-    """Random, but within bounds as learned ones are."""
-    body, mesh = limb(), cloth()
-    hung = weights(mesh.vertices[:, 1])
-    garment = bound()
-    flat = np.linalg.qr(rng.standard_normal((3 * len(mesh.vertices), SHAPES)))[0].T
-    basis = flat.reshape(SHAPES, -1, 3).astype(np.float32)
-    std = rng.uniform(0.05, 0.3, SHAPES).astype(np.float32)
-    model = BlendshapeModel(garment, mesh.vertices, basis, std, NAMES, FPS, "CC0")
-    few = ControlLayout.create(body, hung, FPS, ControlConfig())
-    many = ControlLayout.create(body, hung, FPS, ControlConfig(whole_rotations=True, lags=(2, 4)))
-
-    def scales(layout: ControlLayout) -> Scales:
-        spread = rng.uniform(0.2, 1, layout.size)
-        return Scales(rng.normal(0, 0.1, layout.size).astype(np.float32), spread.astype(np.float32), std)
-
-    def known(layout: ControlLayout, trust: Trust) -> ControlRange:
-        largest = [rng.uniform(0.5, 2) if moves else 0.0 for _, _, moves in layout.parts]
-        poses = 0.3 * rng.standard_normal((30, len(layout.pose_columns)))
-        mean = rng.normal(0, 0.1, layout.size)
-        return ControlRange(mean.astype(np.float32), np.array(largest, np.float32), poses.astype(np.float32), trust)
-
-    matrix = rng.normal(0, 0.05, (few.size, SHAPES)).astype(np.float32)
-    linear = LinearRegressor(few, scales(few), matrix, rng.normal(0, 0.02, SHAPES).astype(np.float32), 0.1)
-    views = tuple(rng.normal(0, 0.2, (many.size, width)).astype(np.float32) for width in (6, 4, 3))
-    kernel = KernelRegressor(
-        many, scales(many), views, np.array([1, 0.5, 2], np.float32), 0.1,
-        rng.standard_normal((40, many.size)).astype(np.float32), rng.normal(0, 0.1, (40, SHAPES)).astype(np.float32),
-        rng.normal(0, 0.02, SHAPES).astype(np.float32), 0.15,
-    )  # fmt: skip
-    torch.manual_seed(1)
-    config = LstmConfig(layers=2, size=16, window=3)
-    network = EncoderDecoder(few.size, SHAPES, config).eval()
-    lstm = LstmRegressor(few, scales(few), config, network, linear)
-    trust = Trust(np.array([[0, 1], [8, 0.9], [8, 0.7], [30, 0.2], [60, 0]], np.float32))
-    ranges = CoefficientRange(std, 2 * std, 2.5, rng.normal(0, 0.01, SHAPES).astype(np.float32))
-    poses = PoseRange(np.zeros((0, len(few.joints), 4), np.float32), few.joints, 12.0)
-    limits = KnownRange(poses, {"linear": known(few, Trust.whole()), "kernel": known(many, trust)}, ranges)
-    return GarmentModel(Path(), model, body, linear, kernel, lstm, limits, {}, "")
-
-
 @pytest.mark.parametrize("name", ["linear", "kernel", "lstm", "ensemble"])
 @pytest.mark.parametrize("beta", [None, (0.5,)])
 def test_a_garment_answers_and_moves_alike_also_far_from_what_it_knows(name: str, beta: tuple[float, ...] | None):
     rng = np.random.default_rng(5)
-    model = garment_model(rng)
+    model = garment_model(limb(), bound(), rng, shapes=5, frames=30, network=LstmConfig(layers=2, size=16))
     regressor, person = model.regressors[name], model.person(beta)
     controls = np.concatenate([0.3 * rng.standard_normal((12, regressor.layout.size)) * scale for scale in (1, 4)])
     controls = controls.astype(np.float32)
