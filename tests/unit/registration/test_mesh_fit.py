@@ -11,7 +11,7 @@ from capture4d.types import GarmentScan, Mesh
 from registration import mesh_fit
 from registration.config import MeshRegistrationConfig, ScanFitConfig, SettleConfig
 from registration.correspondences import mesh_normals
-from registration.mesh_fit import judge
+from registration.mesh_verdict import judge
 from registration.quality import assess
 from registration.register import prepare_frame
 from registration.template import analyse_template
@@ -71,7 +71,7 @@ def test_where_nothing_lies_near_the_way_from_afar_starts_from_a_rigid_motion_al
         return start
 
     monkeypatch.setattr(mesh_fit, "approach", approach)
-    monkeypatch.setattr(mesh_fit, "_reaches", lambda *_: False)
+    monkeypatch.setattr(mesh_fit, "reaches", lambda *_: False)
     scan = scan_of(lambda points: points + np.array([off_m, 0.0, 0.0]))
     rest = garment.template.vertices.astype(np.float64)
     few = replace(config, dense=replace(config.dense, cold=replace(config.dense.cold, steps=1)))
