@@ -157,8 +157,9 @@ class _Attempts:
 
     @property
     def reached(self) -> bool:
-        """Whether an attempt has reached the scan."""
-        return any(attempt.reached for attempt in self.made)
+        """Whether an attempt that keeps lengths has reached the scan. What has been made larger or smaller is another
+        of the template's kind, whose lengths are others in detail as well."""
+        return any(attempt.reached for attempt in self.made if attempt.fit.way not in FREE)
 
     @property
     def has_lost_a_part(self) -> bool:
