@@ -304,18 +304,19 @@ SOFT = RegistrationConfig(
 PAIR = RegistrationConfig(
     data=DataConfig(normals="both", smoothing_passes=4, unshrunk=True),
     dense=DenseConfig(
-        cold=Schedule(8, (0.03, 0.012), smooth=(2.0, 0.2), stretch=(10.0, 0.03), boundary=(0.3, 0.05)),
+        cold=Schedule(
+            4, (0.012, 0.012), smooth=(20.0, 0.2), stretch=(10.0, 0.03), anchor=(0.1, 0.02), boundary=(0.02, 0.02)
+        ),
         plasticity=0.0,
     ),
     quality=QualityConfig(intersections_check_percent=10.0, unfitted_mm=0.0),
 )
-"""Two meshes of one thing: the folds of one are no folds of the other, so that the shape is held more firmly than in a
-take. The softer schedule of takes ends 3 mm farther off (people, 140 mm)."""
+"""Two meshes of one thing. The dense stage comes after the template has settled, and what has settled hardly slides."""
 
 
 @settings
 class SettleConfig:
-    """After the way from afar: limbs turn and slide into their places with the shape that the template has."""
+    """Between the way there and the dense stage: limbs turn and slide into their places with the template's shape."""
 
     steps: Count = 12
     """Gauss-Newton steps; correspondences are renewed before each."""
@@ -325,12 +326,8 @@ class SettleConfig:
     """Weight of how far vertices are off their neighbourhoods as the template has them, turned as they lie."""
     stretch: tuple[NonNegative, NonNegative] = (10.0, 0.03)
     """Weight of lengths along edges against the template's."""
-    boundary: tuple[NonNegative, NonNegative] = (0.3, 0.05)
-    """Weight of E_bound."""
-    polish: Schedule = Schedule(
-        4, (0.012, 0.012), smooth=(20.0, 0.2), stretch=(10.0, 0.03), anchor=(0.1, 0.02), boundary=(0.3, 0.05)
-    )
-    """The vertex by vertex stage after these steps. What has settled hardly slides any more."""
+    boundary: tuple[NonNegative, NonNegative] = (0.3, 0.02)
+    """Weight of E_bound. The shape knows the border better than painted points that a scan has lost here and there."""
 
 
 @settings
@@ -441,7 +438,7 @@ class MeshRegistrationConfig:
     registration: RegistrationConfig = PAIR
     """Settings where lengths are kept, for a template whose diagonal is 1.2 m."""
     settle: SettleConfig = SettleConfig()
-    """Settings of what follows on the way there from afar."""
+    """Settings of what follows on the way there, from near or afar."""
     soft: RegistrationConfig = SOFT
     """Settings where lengths are free."""
     approach: ApproachConfig = ApproachConfig()

@@ -2,12 +2,13 @@
 
 In this order, until the scan is reached:
 
-    near       as a garment of the frame before: coarse, then vertex by vertex, with lengths kept; after the next one
-               where limbs of the scan are out of reach
-    far        drawn there as a whole first (`approach`), settled in its shape (`settle`), limbs that turned about
-               themselves turned back (`untwisted`), then vertex by vertex
+    near       as a garment of the frame before, by the deformation graph; after the next where limbs are out of reach
+    far        drawn there as a whole (`approach`)
     again      once more from there, narrowly, where that lost a part: two hands close to each other both go to the
                middle at first
+
+From there the template settles with its own shape and lengths (`settle`), limbs that turned about themselves on a way
+from afar are turned back (`untwisted`), and a vertex by vertex stage follows.
 
 Where `align` may, and a rigid motion brings the template far nearer, these are tried from there as well; from there
 alone if nothing of the scan lies near the start. Then:
@@ -33,16 +34,17 @@ from capture4d.errors import InputError
 from capture4d.types import Garment, GarmentScan
 from registration.alignment import align, fit_similarity
 from registration.approach import approach, spread_evenly
-from registration.config import ApproachConfig, MeshRegistrationConfig, RegistrationConfig, ScanFitConfig
+from registration.config import ApproachConfig, MeshRegistrationConfig, RegistrationConfig
 from registration.correspondences import mesh_normals
 from registration.geodesic_signature import Likeness, geodesic_signatures, likeness
 from registration.limb_twist import untwisted
-from registration.quality import FrameQuality, assess, scan_distances
+from registration.mesh_verdict import is_tight, reaches
+from registration.quality import assess
 from registration.register import FrameScan, prepare_frame, register_frame
 from registration.settling import settle
 from registration.template import TemplateAnalysis, analyse_template
 
-__all__ = ["Landmarks", "MeshFit", "fit_mesh", "judge"]
+__all__ = ["Landmarks", "MeshFit", "fit_mesh"]
 
 Landmarks = tuple[Int64[np.ndarray, " marks"], Float64[np.ndarray, "marks 3"]]
 """Template vertices, and their places on the scan."""
@@ -72,8 +74,6 @@ MOST_LOST = 0.2
 """Share of the template that may be far from a scan of another size; of half a person it is half."""
 PART_LOST = 0.01
 """Share of the template away from the scan by which a hand may be lost: the way from afar is tried as well."""
-BORDER_MM = 5.0
-"""Mean distance of the template's open borders from the scan above which it does not end where the scan does."""
 FROM_AFAR = ("far", "again", "wide")
 """Ways by `approach`."""
 FREE = ("sized", "soft")
@@ -151,14 +151,15 @@ class _Attempts:
             return False
         quality = assess(self.kept, scan, vertices, self.config.registration.quality)
         fit = MeshFit(vertices, start, self.kept, scan, way)
-        reached = _reaches(self.kept, scan, vertices, self.config.scan_fit) and _tight(quality)
+        reached = reaches(self.kept, scan, vertices, self.config.scan_fit) and is_tight(quality)
         self.made.append(_Attempt(fit, _misfit(self.kept, scan, vertices), reached))
         return reached
 
     @property
     def reached(self) -> bool:
-        """Whether an attempt has reached the scan."""
-        return any(attempt.reached for attempt in self.made)
+        """Whether an attempt that keeps lengths has reached the scan. What has been made larger or smaller is another
+        of the template's kind, whose lengths are others in detail as well."""
+        return any(attempt.reached for attempt in self.made if attempt.fit.way not in FREE)
 
     @property
     def has_lost_a_part(self) -> bool:
@@ -231,14 +232,21 @@ def _keeping_lengths(tried: _Attempts, start: np.ndarray, landmarks: Landmarks |
     config, analysis, scan = tried.config, tried.kept, tried.scan
     own = config.registration
 
+    def placed(there: np.ndarray, *, turning: bool) -> np.ndarray:
+        return register_frame(
+            analysis, scan, _settled(tried, there, turning=turning), config=_dense_alone(own)
+        ).vertices
+
+    def carried(begin: np.ndarray) -> np.ndarray:
+        there = register_frame(analysis, scan, begin, config=_coarse_alone(own)).vertices
+        return placed(there, turning=False)
+
     def near(begin: np.ndarray) -> bool:
-        return tried.add("near", begin, lambda: register_frame(analysis, scan, begin, config=own).vertices)
+        return tried.add("near", begin, lambda: carried(begin))
 
     def drawn(begin: np.ndarray, votes: ApproachConfig, told: Signatures | None) -> np.ndarray:
         there = approach(analysis, scan.surface, begin, votes, signatures=told, landmarks=landmarks)
-        settled = _settled(tried, there)
-        polish = replace(own, dense=replace(own.dense, cold=config.settle.polish))
-        return register_frame(analysis, scan, settled, config=_dense_alone(polish)).vertices
+        return placed(there, turning=True)
 
     def far(begin: np.ndarray) -> bool:
         told = tried.signatures
@@ -252,11 +260,12 @@ def _keeping_lengths(tried: _Attempts, start: np.ndarray, landmarks: Landmarks |
     movable = config.align == "auto" and landmarks is None
     if config.lengths == "free":
         return _moved_there(start, scan) if movable else start
-    swinging = landmarks is None and _limbs_are_away(start, scan)
+    bare = landmarks is None and not len(scan.border_points)  # painted borders are found from farther
+    swinging = bare and _limbs_are_away(start, scan)
     if swinging and far(start):
         return start
     if landmarks is None and near(start):
-        if tried.has_lost_a_part:
+        if bare and tried.has_lost_a_part:
             far(start)
         return start
     elsewhere = tried.fault is not None
@@ -276,11 +285,15 @@ def _keeping_lengths(tried: _Attempts, start: np.ndarray, landmarks: Landmarks |
     return moved
 
 
-def _settled(tried: _Attempts, there: np.ndarray) -> np.ndarray:
-    """The template settled on the scan, and once more with its limbs turned back, if that brings it nearer."""
+def _settled(tried: _Attempts, there: np.ndarray, *, turning: bool) -> np.ndarray:
+    """The template settled on the scan.
+
+    Args:
+        turning: once more with its limbs turned back, if that brings it nearer.
+    """
     analysis, scan, config = tried.kept, tried.scan, tried.config
     settled = settle(analysis, scan, there, config.settle, config.registration)
-    turned = untwisted(analysis, scan.surface, settled)
+    turned = untwisted(analysis, scan.surface, settled) if turning else None
     if turned is None:
         return settled
     again = settle(analysis, scan, turned, config.settle, config.registration)
@@ -339,6 +352,11 @@ def _moved_there(start: np.ndarray, scan: FrameScan) -> np.ndarray:
     return moved if away(moved) < CLEARLY * now else start
 
 
+def _coarse_alone(config: RegistrationConfig) -> RegistrationConfig:
+    """What settles next needs to lie on the scan only."""
+    return replace(config, dense=replace(config.dense, cold=replace(config.dense.cold, steps=0)))
+
+
 def _dense_alone(config: RegistrationConfig) -> RegistrationConfig:
     """Where the template lies on the scan already, nodes only push it about."""
     cold = replace(config.coarse.cold, steps=0)
@@ -354,81 +372,3 @@ def _misfit(analysis: TemplateAnalysis, scan: FrameScan, vertices: np.ndarray) -
     there = np.concatenate([scan.surface.points, NORMAL_LENGTH * scan.surface.normals], axis=1)
     back, forth = KDTree(here).query(there[other])[0], KDTree(there).query(here[own])[0]
     return float(np.minimum(back, FARTHEST).mean() + np.minimum(forth, FARTHEST).mean())
-
-
-# --- verdicts ----------------------------------------------------------------------------------------------------
-
-FACETS = 0.05
-"""Share of an edge by which a face may cut off what is round: a coarse template has not failed for it."""
-TIGHT_MM, TIGHT_STRETCH = 0.8, 1.6
-"""Mean distance from template to scan, and 99th percentile of the stretch, of what needs no other attempt."""
-
-
-def _tight(quality: FrameQuality) -> bool:
-    numbers = quality.numbers
-    return numbers["fit_mean_mm"] <= TIGHT_MM and numbers["stretch_p99"] <= TIGHT_STRETCH
-
-
-def _reaches(analysis: TemplateAnalysis, scan: FrameScan, vertices: np.ndarray, config: ScanFitConfig) -> bool:
-    """Whether the template lies on all of the scan, beyond its borders as well, and ends where the scan does."""
-    away = 1e3 * scan_distances(analysis, scan, vertices)[0]
-    border = vertices[analysis.border.vertices]
-    hanging = 1e3 * float(scan.surface.grid.query(border)[0].mean()) if len(border) else 0.0
-    ends = hanging <= BORDER_MM + 1e3 * scan.surface.spacing
-    return bool(ends and away.mean() <= config.check_mm and np.percentile(away, 95) <= config.far_check_mm)
-
-
-def judge(
-    quality: FrameQuality,
-    analysis: TemplateAnalysis,
-    scan: FrameScan,
-    vertices: Float64[np.ndarray, "verts 3"],
-    config: ScanFitConfig,
-    *,
-    start: Float64[np.ndarray, "verts 3"],
-    length_factor: float = 1.0,
-) -> tuple[str, tuple[str, ...]]:
-    """Verdict and reasons, with what a take's frames are not judged by: what of the scan the template leaves unreached,
-    and how far it has swung.
-
-    Args:
-        start: where the template lay, metres.
-        length_factor: the reasons give lengths times this.
-    """
-    every, nearest = scan_distances(analysis, scan, vertices)
-    beyond = np.isin(nearest, analysis.border.vertices)  # of an open border, where the scan may go on
-    away = every if beyond.all() else every[~beyond]
-    mean, far = 1e3 * float(away.mean()), 1e3 * float(np.percentile(away, 95))
-    facets = 1e3 * FACETS * float(analysis.rest_lengths.mean())
-    past = 100.0 * float((beyond & (1e3 * every > config.far_fail_mm)).mean())
-    rigid = fit_similarity(start, vertices, with_scale=False).apply(start)
-    swung = 1e3 * float(np.linalg.norm(vertices - rigid, axis=1).mean())
-    lost = 100.0 * float((1e3 * scan.surface.grid.query(vertices)[0] > config.far_fail_mm).mean())
-    unreached = mean > config.check_mm + facets or far > config.far_check_mm + facets
-    share = 100.0 / max(len(analysis.faces), 1)
-    flipped, cut = quality.numbers["flipped_faces"] * share, quality.numbers["self_intersections"] * share
-    failed, check = [], []
-    for name, value, doubtful, wrong, unit in (
-        ("mean distance from scan to template", mean, config.check_mm + facets, config.fail_mm + facets, " mm"),
-        ("95 % of the scan within", far, config.far_check_mm + facets, config.far_fail_mm + facets, " mm"),
-        ("share of the scan beyond the template's borders", past, config.beyond_check_percent, np.inf, " %"),
-        (
-            "share of the template far from the scan",
-            lost,
-            config.lost_check_percent,
-            config.lost_fail_percent if unreached else np.inf,
-            " %",
-        ),
-        ("mean way beyond a rigid motion", swung, config.swung_check_mm, np.inf, " mm"),
-        ("flipped faces", flipped, np.inf, config.flipped_fail_percent, " %"),
-        ("self-intersecting faces", cut, np.inf, config.cut_fail_percent, " %"),
-    ):
-        factor = length_factor if unit == " mm" else 1.0
-        if value > doubtful or value > wrong:
-            limit = wrong if value > wrong else doubtful
-            (failed if value > wrong else check).append(f"{name} {value * factor:.3g} > {limit * factor:.3g}{unit}")
-    if failed or quality.verdict == "failed":
-        return "failed", ((*quality.reasons,) if quality.verdict == "failed" else ()) + tuple(failed)
-    if check or quality.verdict == "check":
-        return "check", (*quality.reasons, *check)
-    return "good", ()

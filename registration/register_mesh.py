@@ -32,7 +32,8 @@ from capture4d.units import METRES, Units
 from registration.config import MeshRegistrationConfig
 from registration.floor import find_floor
 from registration.landmarks import Landmarks, read_landmarks
-from registration.mesh_fit import fit_mesh, judge
+from registration.mesh_fit import fit_mesh
+from registration.mesh_verdict import judge
 from registration.quality import FrameQuality, assess
 
 __all__ = ["FindBorder", "MeshRegistration", "register_mesh", "run"]
@@ -57,7 +58,7 @@ class MeshRegistration:
     quality: FrameQuality
     """Judged on the normalised problem; all its lengths, those in `reasons` too, are of the files' world."""
     way: str = ""
-    """Which attempt counts: near, far, wide, sized, or soft (`registration.mesh_fit`)."""
+    """Which attempt counts: near, far, again, wide, sized, or soft (`registration.mesh_fit`)."""
     estimated: bool = False
     """The scan came as points alone; its faces are made between them."""
     floor_percent: float = 0.0

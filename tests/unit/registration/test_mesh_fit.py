@@ -7,11 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from capture4d.geometry.mesh import submesh
-from capture4d.types import GarmentScan, Mesh
+from capture4d.types import Garment, GarmentScan, Mesh
 from registration import mesh_fit
 from registration.config import MeshRegistrationConfig, ScanFitConfig, SettleConfig
 from registration.correspondences import mesh_normals
-from registration.mesh_fit import judge
+from registration.mesh_verdict import judge
 from registration.quality import assess
 from registration.register import prepare_frame
 from registration.template import analyse_template
@@ -71,7 +71,7 @@ def test_where_nothing_lies_near_the_way_from_afar_starts_from_a_rigid_motion_al
         return start
 
     monkeypatch.setattr(mesh_fit, "approach", approach)
-    monkeypatch.setattr(mesh_fit, "_reaches", lambda *_: False)
+    monkeypatch.setattr(mesh_fit, "reaches", lambda *_: False)
     scan = scan_of(lambda points: points + np.array([off_m, 0.0, 0.0]))
     rest = garment.template.vertices.astype(np.float64)
     few = replace(config, dense=replace(config.dense, cold=replace(config.dense.cold, steps=1)))
@@ -83,3 +83,46 @@ def test_where_nothing_lies_near_the_way_from_afar_starts_from_a_rigid_motion_al
     assert np.allclose(starts[0], rest) == (off_m == 0.0)
     for start in starts:
         assert abs(start[:, 0].mean() - scan.mesh.vertices[:, 0].mean()) < 0.1
+
+
+@pytest.mark.parametrize(("move", "first"), [(bent, "approach"), (lambda points: points + 0.01, "register_frame")])
+def test_where_limbs_are_out_of_reach_the_way_from_afar_comes_first(
+    move, first: str, garment, scan_of, config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bare, scan = Garment(garment.template, {}), unpainted(scan_of(move))
+    called = []
+    for name in ("approach", "register_frame"):
+        make = getattr(mesh_fit, name)
+        monkeypatch.setattr(
+            mesh_fit, name, lambda *given, name=name, make=make, **how: called.append(name) or make(*given, **how)
+        )
+    monkeypatch.setattr(mesh_fit, "reaches", lambda *_: True)
+    few = MeshRegistrationConfig(lengths="kept", registration=config, settle=SettleConfig(steps=1))
+    mesh_fit.fit_mesh(bare, scan, garment.template.vertices.astype(np.float64), few)
+    assert called[0] == first
+
+
+def test_what_is_not_reached_from_afar_is_tried_once_more_from_there(
+    garment, scan_of, config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Narrower, and from where the first attempt has led."""
+    tries = []
+
+    def approach(analysis, surface, start, votes, *, signatures, landmarks) -> np.ndarray:
+        tries.append((votes.signature_width, start))
+        return start + 0.02
+
+    monkeypatch.setattr(mesh_fit, "approach", approach)
+    monkeypatch.setattr(mesh_fit, "reaches", lambda *_: len(tries) == 2)
+    rest = garment.template.vertices.astype(np.float64)
+    few = MeshRegistrationConfig(lengths="kept", registration=config, settle=SettleConfig(steps=1))
+    fitted = mesh_fit.fit_mesh(Garment(garment.template, {}), unpainted(scan_of(bent)), rest, few)
+    widths = [width for width, _ in tries]
+    assert widths == [few.approach.signature_width, few.approach.again_width]
+    np.testing.assert_array_equal(tries[0][1], rest)
+    assert np.abs(tries[1][1] - rest).max() > 0.005
+    assert fitted.way in ("far", "again")
+
+
+def unpainted(scan: GarmentScan) -> GarmentScan:
+    return replace(scan, boundary_points=scan.boundary_points[:0], boundary_loops=scan.boundary_loops[:0])
