@@ -32,6 +32,9 @@ CALM_ASIDE = (0.55, 0.95)
 """Shares of the half width between which it ends towards the sides."""
 YOKE_M = (0.0, 0.06)
 """Above the underarm, between these, it widens to the armholes, and begins on the sleeves' caps."""
+WALL_LEANS, WALL_RETREAT_M = (0.45, 0.75), 0.15
+"""Between these sines of an arm's angle out of the body's frontal plane its wall gives way, by this at most: an arm
+that points forwards has the chest on its own side."""
 SLEEVE_SIDE = 0.3
 """Share of the half width beyond which front and back can meet the sleeve."""
 
@@ -77,6 +80,8 @@ class Wall:
     """(3,) towards the arm."""
     along: np.ndarray
     """(3,) away from the shoulder, half-way between arm and trunk."""
+    retreat: float = 0.0
+    """How far the plane has given way to both, metres."""
 
 
 def tailor(mesh: PanelMesh, pattern: Pattern, folds: FoldConfig) -> Tailoring:
@@ -123,7 +128,9 @@ def walls(sleeves: tuple[Sleeve, ...], body: PosedBody) -> tuple[Wall, ...]:
         shoulder, elbow = (centres[names.index(f"{bone}.{sleeve.side}")] for bone in ("upperarm01", "lowerarm01"))
         arm = _unit(elbow - shoulder)
         outwards = 0.1 * aside if sleeve.side == "L" else -0.1 * aside  # an arm along the trunk still has a side
-        found.append(Wall(_unit(arm - down + outwards), _unit(arm + down + outwards)))
+        leans = np.abs([arm @ _unit(np.cross(down, aside))])
+        retreat = WALL_RETREAT_M * float(_smooth_step(leans, *WALL_LEANS)[0])
+        found.append(Wall(_unit(arm - down + outwards), _unit(arm + down + outwards), retreat))
     return tuple(found)
 
 
@@ -131,7 +138,7 @@ def wall_heights(points: np.ndarray, sleeve: Sleeve, wall: Wall) -> tuple[np.nda
     """How far the sleeve's `rows` of some points, (V, 3), are on their own side of the wall, and how far below the
     underarm, both (n,) metres; above the underarm there is no wall."""
     from_underarm = points[sleeve.rows] - points[sleeve.underarm]
-    return sleeve.signs * (from_underarm @ wall.normal), from_underarm @ wall.along
+    return sleeve.signs * (from_underarm @ wall.normal) + wall.retreat, from_underarm @ wall.along
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:

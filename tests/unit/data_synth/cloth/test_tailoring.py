@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from capture4d.body.skinning import ShapedBody, with_pose
 from data_synth.cloth.fabrics import Fabric
 from data_synth.cloth.panels import Pattern
 from data_synth.cloth.patterns import PanelMesh, locate, mesh_pattern
-from data_synth.cloth.tailoring import Made, bending_factors, shrunk, tailor, wall_heights, walls
+from data_synth.cloth.tailoring import WALL_RETREAT_M, Made, bending_factors, shrunk, tailor, wall_heights, walls
 from data_synth.cloth.tshirt import tshirt_pattern
 from data_synth.config import FoldConfig, GarmentStyle
 
@@ -92,3 +93,22 @@ def test_a_wall_parts_arm_and_trunk(person: ShapedBody, shirt, raised_deg: float
         here = left.rows != left.underarm
         assert below[here].min() > 0
         np.testing.assert_array_equal(heights[here] < 0, wrong[here])
+
+
+def test_the_wall_of_an_arm_that_points_forwards_leaves_the_chest_alone(person: ShapedBody, shirt) -> None:
+    pattern, mesh = shirt
+    names = person.body.joint_names
+    left = tailor(mesh, pattern, FOLDS).sleeves[0]
+    rest = np.repeat(np.eye(3)[None], len(names), axis=0)
+    joints = with_pose(person, rest, np.zeros(3)).joint_centres()
+    arm = joints[names.index("lowerarm01.L")] - joints[names.index("upperarm01.L")]
+    forwards = rest.copy()
+    forwards[names.index("upperarm01.L")] = Rotation.align_vectors([[0.0, -0.3, 1.0]], [arm])[0].as_matrix()
+    aside, ahead = (walls((left,), with_pose(person, each, np.zeros(3)))[0] for each in (rest, forwards))
+    assert (aside.retreat, ahead.retreat) == (0, WALL_RETREAT_M)
+    points = np.zeros((mesh.vertex_count, 3))
+    points[left.rows[left.rows != left.underarm]] = [-0.03, -0.02, 0.1]  # the chest, before the underarm
+    heights, below = wall_heights(points, left, ahead)
+    trunk = left.signs < 0
+    assert below[trunk].max() > 0
+    assert heights[trunk].min() > 0

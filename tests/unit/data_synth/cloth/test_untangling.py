@@ -35,8 +35,8 @@ def settle(points: np.ndarray, faces: np.ndarray, steps: int, *, rests: bool = F
     """Untangle; the layers may rest on a body just beneath them, which else is a metre below."""
     edges = unique_edges(faces).astype(np.int32)
     lengths = np.linalg.norm(points[edges[:, 1]] - points[edges[:, 0]], axis=1)
-    beneath = points if rests else points - np.float32([0, 0, 1])
-    room = Room(points, 0.1, beneath, np.tile(np.float32([0, 0, 1]), (len(points), 1)), 0.0)
+    beneath = points if rests else points - np.array([0, 0, 1], np.float32)
+    room = Room(points, 0.1, beneath, np.tile(np.array([0, 0, 1], np.float32), (len(points), 1)), 0.0)
     return untangle(points, faces, edges, lengths, room, steps=steps)
 
 
