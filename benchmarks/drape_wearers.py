@@ -39,7 +39,7 @@ STANDING = PoseConfig(
 )  # fmt: skip
 SQUAT = replace(STANDING, hip_flexion=(80, 80), hip_abduction=(15, 15), knee=(100, 100))
 FAR_FLEXED_DEG = 60.0
-"""Beyond which a hip makes a pose a squat, whose edges may be 1.2 of their length; so with arms above the horizontal."""
+"""Beyond which a hip makes a pose a squat, whose edges may be 1.2 of their length; so may they with a raised arm."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,8 +65,8 @@ class WearerDrapes:
 def wearers(
     names: Sequence[GarmentName], *, vertices: Mapping[GarmentName, int], samples: int, seed: int
 ) -> list[tuple[str, DrapesConfig]]:
-    """Who wears what: the name of a person and the settings of the drapes. Patterns are drafted for who wears them: what
-    is cut for the mean person does not fit a heavy one."""
+    """Who wears what: the name of a person and the settings of the drapes. Patterns are drafted for who wears them:
+    what is cut for the mean person does not fit a heavy one."""
     return [
         (
             person,
@@ -110,9 +110,9 @@ def measure_wearer(job: tuple[str, DrapesConfig]) -> WearerDrapes:
 
 
 def garment_figures(worn: Sequence[WearerDrapes]) -> dict[str, tuple[float, str]]:
-    """Figures of a garment over all who wear it, with units: kept, of all and of the worst wearer; stretch that 95 % of
-    the drapes are below, in calm poses and in squats and with raised arms (NaN where there is none); vertices inside the
-    body, of all drapes and of the kept; the farthest slip of a waistband."""
+    """Figures of a garment over all who wear it, with units: kept, of all and of the worst wearer; stretch that 95 %
+    of the drapes are below, in calm poses and in squats and with raised arms (NaN where there is none); vertices inside
+    the body, of all drapes and of the kept; the farthest slip of a waistband."""
     quality = [each for one in worn for each in one.quality]
     far = np.concatenate([one.far for one in worn])
     stretch = np.array([each.stretch_p99 for each in quality])

@@ -7,8 +7,8 @@ length (1.2 with arms overhead). Against the moving simulator on its way into th
 percentile of stretch within 0.02, the hem within 12 mm of its height. It has the whole cloth there: what it makes for
 fine folds to be put on is cut smaller, and 14 mm shorter in the same pose.
 
-Every garment in two styles on three people: at least 85 % kept, 99 % of edges within 1.15 (1.2 in squats and with raised
-arms), a waistband that slips by at most 10 mm standing and 25 mm in a squat, at most 0.05 % inside the body.
+Every garment in two styles on three people: at least 85 % kept, 99 % of edges within 1.15 (1.2 in squats and with
+raised arms), a waistband that slips by at most 10 mm standing and 25 mm in a squat, at most 0.05 % inside the body.
 """
 
 from __future__ import annotations

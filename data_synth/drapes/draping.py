@@ -29,8 +29,8 @@ __all__ = ["Drape", "Draper", "part_contacts", "symmetric_person"]
 CLOSING_FRAMES, CLOSING_KEEP = 60, 0.95
 """In which panels hung around the body come to lie on it, and the share of the velocity that a substep leaves then."""
 OUT_MARGINS, LOOK_AGAIN = (0.5, 0.45, 0.4, 0.35, 0.3, 0.25, 0.2, 0.15), (0, 4)
-"""Shares of the margin to which vertices are pushed out of the body at the end, in turn with lengths and areas kept, and
-the turns in which all of the body is looked at. What the one undoes of the other gets less."""
+"""Shares of the margin to which vertices are pushed out of the body at the end, in turn with lengths and areas kept,
+and the turns in which all of the body is looked at. What the one undoes of the other gets less."""
 WEIGHT_SMOOTHING = 20
 """Further diffusion steps on skin weights: places that bend over a wider stretch do not crumple what they hold."""
 OFFSET_SMOOTHING = 12
