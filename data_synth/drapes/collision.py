@@ -17,6 +17,7 @@ from scipy.spatial import KDTree
 
 from capture4d.body.skinning import PosedBody, ShapedBody, skin
 from capture4d.geometry.mesh import vertex_adjacency, vertex_normals
+from capture4d.geometry.ray_casting import TriangleScene, barycentric
 from capture4d.geometry.triangles import closest_in_triangle, row3
 from capture4d.heavy_imports import njit
 from data_synth.drapes.solver import Planes
@@ -133,6 +134,25 @@ class Wearing:
             points, vertices, parts, self._at, surface.vertices, surface.normals, body.faces, body.inside,
             body.part_faces, *body.neighbours, *body.fans, feet, normals,
         )  # fmt: skip
+        return Planes(vertices, feet, normals)
+
+    def look_up_exactly(self, points: np.ndarray, surface: Surface) -> Planes:
+        """The same from the nearest point of all of each part: where skin is near skin, a walk may end on the other."""
+        vertices, parts = self._contacts
+        feet, normals = np.empty((len(vertices), 3)), np.empty((len(vertices), 3))
+        for part, own in enumerate(self.parts.part_faces):
+            rows = np.flatnonzero(parts == part)
+            if not len(rows):
+                continue
+            faces = self.parts.faces[own]
+            near = TriangleScene((surface.vertices, faces)).nearest(points[vertices[rows]])
+            feet[rows] = near.points
+            normals[rows] = np.einsum("nk,nkx->nx", barycentric(near.uv), surface.normals[faces[near.faces]])
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True) + 1e-12
+        offsets = points[vertices] - feet
+        heights, apart = np.einsum("cx,cx->c", offsets, normals), np.linalg.norm(offsets, axis=1)
+        beside = (apart > BESIDE_M) & (heights < 0) & (heights > -BESIDE_COSINE * apart)
+        feet[beside] = (points[vertices] - normals)[beside]
         return Planes(vertices, feet, normals)
 
 

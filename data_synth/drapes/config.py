@@ -148,11 +148,11 @@ class SolverConfig:
     """Sixtieths of a second after which a drape that still moves is flagged."""
     keep: Annotated[float, Range(least=0.9, most=1)] = 0.99
     """Share of the velocity that is left after a substep."""
-    calm_after_frames: Whole = 30
+    calm_after_frames: Whole = 16
     """Sixtieths of a second after which every further one damps as much more: what is pinched in a crease of the body
     never rests by itself."""
-    margin_m: NonNegative = 0.004
-    """Distance at which the cloth lies over the body, metres."""
+    margin_m: NonNegative = 0.005
+    """Distance at which the cloth lies over the body, metres; that of the moving simulator."""
 
 
 @settings

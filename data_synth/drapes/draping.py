@@ -28,8 +28,9 @@ __all__ = ["Drape", "Draper", "part_contacts", "symmetric_person"]
 
 CLOSING_FRAMES, CLOSING_KEEP = 60, 0.95
 """In which panels hung around the body come to lie on it, and the share of the velocity that a substep leaves then."""
-OUT_PASSES = 6
-"""At the end, of edges kept within their limits and vertices pushed out of the body."""
+OUT_MARGINS, EXACT = (0.5, 0.45, 0.4, 0.35, 0.3, 0.25, 0.2, 0.15), (3, 7)
+"""Shares of the margin to which vertices are pushed out of the body at the end, in turn with lengths and areas kept,
+and the turns in which the nearest skin is looked for everywhere. What the one undoes of the other gets less."""
 WEIGHT_SMOOTHING = 20
 """Further diffusion steps on skin weights: places that bend over a wider stretch do not crumple what they hold."""
 OFFSET_SMOOTHING = 12
@@ -90,8 +91,9 @@ class Draper:
             self.person = wearer
             moved = _moved(worn, self.mesh, mean, self.person)
             own = _Fitting(self, kind, self.mesh, self.person)
-            posed = with_pose(self.person, kind.dressing(self.person), np.zeros(3))
-            worn = own.put_on(skin(moved, worn.skin_weights, posed.transforms))
+            moved = skin(moved, worn.skin_weights, own.body.transforms)
+            anew = kind.pinned and to_measure
+            worn = own.put_on(hung(config.garment, self.mesh, graded, own.body) if anew else moved)
         self._fitting, self._worn = own, worn
 
     @property
@@ -237,9 +239,10 @@ class _Fitting:
             motion = 1e3 * float(np.linalg.norm(positions - before, axis=1).mean())
             frames += 1
         wearing.begin_again(positions, surface)
-        for _ in range(OUT_PASSES):
+        for done, share in enumerate(OUT_MARGINS):
             keep_lengths(self.sheet, positions)
-            positions = _pushed_out(positions, wearing.look_up(positions, surface), solver.margin_m / 2)
+            look_up = wearing.look_up_exactly if done in EXACT else wearing.look_up
+            positions = _pushed_out(positions, look_up(positions, surface), share * solver.margin_m)
         return Drape(positions, frames, motion)
 
     def _held(self, points: np.ndarray, start: np.ndarray) -> _Worn:

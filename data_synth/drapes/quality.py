@@ -27,7 +27,7 @@ CUT_LIMIT_PERCENT = 15.0
 each other in every strongly bent pose; beyond this share something is turned inside out."""
 INSIDE_M = 1e-3
 ROOM_M = 5e-3
-"""Between skin and other skin nearer than this there is no room for cloth, which lies 2 to 4 mm over either: thigh and
+"""Between skin and other skin nearer than this there is no room for cloth, which lies 1 to 5 mm over either: thigh and
 calf of a squat touch and run through each other, and what is between them cannot be outside both."""
 
 

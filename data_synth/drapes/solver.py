@@ -33,6 +33,11 @@ FRAME_SUBSTEPS = 24
 GRAVITY = 9.81
 OUTWARDS_M = 0.002
 """A substep pushes a vertex no farther out of the body: what is deep inside comes out in several, and is not thrown."""
+OVERSHOOT = 1.5
+"""Of the correction of stretched edges. One sweep a step leaves a hanging sheet longer than its stiffness would, a
+shirt by 9 mm; successive over-relaxation brings it there sooner. 1.3 leaves 5 mm, 1.9 takes three times as long."""
+AREA_LIMITS = (0.45, 1.6)
+"""Shares of its area within which a face ends: a sliver has edges of about their lengths, and no area."""
 FARTHEST_M = 0.005
 """Nor does a vertex take a velocity along that would move it farther in the next."""
 
@@ -58,6 +63,8 @@ class Sheet:
     """(Q, 4) how far each vertex is moved in a substep, over the stencil's value."""
     inverse_masses: np.ndarray
     """(V,), 0 for a vertex that is pinned."""
+    faces: np.ndarray
+    """(F, 3) int32."""
     areas: np.ndarray
     """(F,) of the faces on the pattern."""
     friction: float
@@ -73,11 +80,12 @@ class Sheet:
         around = np.bincount(corners, np.repeat(areas, 3), minlength=count) / np.bincount(corners, minlength=count)
         inverse_masses = 1 / (cloth.density * shares)
         inverse_masses[pinned] = 0.0
-        edge_order, hinge_order = _by_sides(edges, mesh.mirror), _by_sides(stencils[:, :2], mesh.mirror)
+        edge_order = _by_sides(edges, mesh.mirror, mesh.vertex_uv[:, 1])
+        hinge_order = _by_sides(stencils[:, :2], mesh.mirror, mesh.vertex_uv[:, 1])
         edges, lengths = edges[edge_order], lengths[edge_order]
         both = inverse_masses[edges].sum(axis=1)
         gives = 1 / (np.array([cloth.stretch_stiffness, np.inf, cloth.compression_stiffness]) * SUBSTEP_S**2)
-        firmness = 1 / np.maximum(both[:, None] + gives, 1e-9)
+        firmness = np.array([OVERSHOOT, 1.0, 1.0]) / np.maximum(both[:, None] + gives, 1e-9)
         firmness[both == 0] = 0
         stencils, weights = stencils[hinge_order], weights[hinge_order, :4]
         # Energy of a hinge: 3 k / (A1 + A2) times half the squared stencil; A from the faces around its corners.
@@ -92,17 +100,19 @@ class Sheet:
             hinge_weights=np.ascontiguousarray(weights),
             hinge_moves=pulled / ((weights * pulled).sum(axis=1) + hinge_give)[:, None],
             inverse_masses=inverse_masses,
+            faces=np.ascontiguousarray(mesh.faces, np.int32),
             areas=areas,
             friction=cloth.friction,
         )
 
 
-def _by_sides(edges: np.ndarray, mirror: np.ndarray | None) -> np.ndarray:
-    """An order of edges, (E, 2), in which each is followed by its mirror image."""
+def _by_sides(edges: np.ndarray, mirror: np.ndarray | None, heights: np.ndarray) -> np.ndarray:
+    """An order of edges, (E, 2), from the top of the draft downwards, in which each is followed by its mirror image."""
+    downwards = -np.round(heights[edges].mean(axis=1), 5)
     if mirror is None:
-        return np.arange(len(edges))
+        return np.argsort(downwards, kind="stable")
     own, image = (np.sort(each, axis=1).astype(np.int64) @ (len(mirror), 1) for each in (edges, mirror[edges]))
-    return np.lexsort((own, np.minimum(own, image)))
+    return np.lexsort((own, np.minimum(own, image), downwards))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,18 +168,45 @@ def advance(
 
 
 def keep_lengths(sheet: Sheet, positions: np.ndarray) -> None:
-    """Move positions, (V, 3) float64 and changed in place, until edges are about within their limits: one sweep there,
-    one back."""
+    """Move positions, (V, 3) float64 and changed in place, until edges and the areas of faces are about within their
+    limits: one sweep there, one back, one over the faces."""
     _keep_lengths(
         positions, sheet.inverse_masses, sheet.edges, sheet.lengths, sheet.edge_firmness * (0, 1, 0),
-        *sheet.strain_limits,
+        *sheet.strain_limits, sheet.faces, sheet.areas, *AREA_LIMITS,
     )  # fmt: skip
 
 
 @njit(cache=True, fastmath=True, nogil=True)
-def _keep_lengths(x, inverse_mass, edges, lengths, firmness, shortest, longest):
+def _keep_lengths(
+    x, inverse_mass, edges, lengths, firmness, shortest, longest, faces, areas, smallest, largest
+):  # fmt: skip
     _stretch(x, inverse_mass, edges, lengths, firmness, shortest, longest, True)
     _stretch(x, inverse_mass, edges, lengths, firmness, shortest, longest, False)
+    normal, gradient = np.empty(3), np.empty((3, 3))
+    for f in range(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        _cross(x[b] - x[a], x[c] - x[a], normal)
+        area = 0.5 * np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
+        excess = area - min(max(area, smallest * areas[f]), largest * areas[f])
+        if excess == 0.0 or area < 1e-9:
+            continue
+        normal /= 2 * area
+        moved = 1e-12
+        for k in range(3):
+            _cross(normal, x[faces[f, (k + 2) % 3]] - x[faces[f, (k + 1) % 3]], gradient[k])
+            for m in range(3):
+                gradient[k, m] *= 0.5
+                moved += inverse_mass[faces[f, k]] * gradient[k, m] ** 2
+        for k in range(3):
+            for m in range(3):
+                x[faces[f, k], m] -= excess / moved * inverse_mass[faces[f, k]] * gradient[k, m]
+
+
+@njit(cache=True, fastmath=True, nogil=True, inline="always")
+def _cross(a, b, out):
+    out[0] = a[1] * b[2] - a[2] * b[1]
+    out[1] = a[2] * b[0] - a[0] * b[2]
+    out[2] = a[0] * b[1] - a[1] * b[0]
 
 
 @njit(cache=True, fastmath=True, nogil=True, error_model="numpy")

@@ -97,7 +97,7 @@ def _page(drapes: DrapeSet) -> str:
     return render_page(
         "capture4d.app.report",
         "drapes.html.jinja",
-        title=f"Drapes of a {about['garment']}",
+        title=f"Drapes of {'' if about['garment'] == 'trousers' else 'a '}{about['garment']}",
         subtitle=f"{len(drapes.kept):,} poses, {len(mesh.vertices):,} vertices; {style}",
         tiles=_tiles(drapes),
         pruned=_pruned(drapes),
