@@ -158,6 +158,7 @@ def _configs(sizes: _Sizes, epochs: int, baseline_epochs: int, scale: Scale) -> 
         "pca_with_kernels": replace(baseline("pca"), partner=True),
         "pca_over_kernels": replace(baseline("pca"), residual=True),
         "direct": baseline("direct"),
+        "direct_with_kernels": replace(baseline("direct"), partner=True),
         "decoder": decoder,
         "decoder_l2": replace(decoder, training=replace(decoder.training, normal_weight=0.0)),
         "decoder_l1": replace(decoder, training=replace(decoder.training, norm="l1", normal_weight=0.0)),
@@ -167,7 +168,6 @@ def _configs(sizes: _Sizes, epochs: int, baseline_epochs: int, scale: Scale) -> 
         found |= {
             "direct_root": replace(baseline("direct"), space="root_offset"),
             "pca_not_mirrored": replace(baseline("pca"), mirrored=False),
-            "decoder_with_kernels": replace(decoder, partner=True),
             "patches": replace(decoder, network="patches", patch=sizes.patch),
         }
     return found

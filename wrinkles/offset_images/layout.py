@@ -179,7 +179,7 @@ class OffsetLayout:
 
 def worn_part(layout: OffsetLayout, body: Body) -> tuple[OffsetLayout, Body]:
     """The layout on the skin that its garment is bound to, and on the faces around that: the same
-    anchors, up to rounding, in a fraction of the time, where many frames are to be encoded or decoded."""
+    anchors, up to rounding, in less time, where many frames are to be encoded or decoded."""
     garment, faces = layout.garment, body.template.faces
     assert garment.embedding_faces is not None
     under = np.zeros(len(body.template.vertices), bool)

@@ -71,8 +71,9 @@ def run(
     motion = _motion(poses, known, config.fps)
     upstream = {"model": record["digest"], "poses": file_digest([poses], root=poses.parent)}
     stage = open_frames(output, asdict(config), upstream, {"model": model, "poses": poses}, overwrite=overwrite)
-    for path, write, value in zip(motion_files(output), (save_body, save_poses), (body, motion), strict=True):
-        write(path, value)
+    body_path, poses_path = motion_files(output)
+    save_body(body_path, body)
+    save_poses(poses_path, motion)
     save_garment(stage.path / "garment.npz", replace(garment, body_shape=np.asarray(shape, np.float32)))
     frame_ids = [int(frame_id) for frame_id in motion.frame_ids]
     pending = set(stage.pending(frame_ids))

@@ -248,7 +248,7 @@ def test_a_predicted_garment_leaves_the_body(drapes: Path, tmp_path: Path):
     ).path
     parts = load_drape_offsets(model).parts
     assert parts.kernels is not None
-    deeper = np.tile(np.float32([0, 0, 7]), len(parts.kernels.mean) // 3)
+    deeper = np.tile(np.array([0, 0, 7], np.float32), len(parts.kernels.mean) // 3)
     sunk = replace(parts.kernels, mean=parts.kernels.mean - deeper)
     record = (model / "stage.json").read_bytes()
     save_model_parts(model, replace(parts, kernels=sunk))
