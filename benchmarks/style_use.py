@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks.metric import Metric
 from capture4d.body.limbs import WornBody
-from capture4d.body.skinning import with_pose
+from capture4d.body.skinning import skin, with_pose
 from capture4d.captures.drapes.style_sets import Ranges
 from capture4d.geometry.intersection_removal import Penetration
 from capture4d.learning.convex_fits import furthest_first
@@ -75,7 +75,8 @@ def fit_metrics(garment: StyledGarment, lesson: StyleLesson, *, frames: int = 3)
     for index, pair in enumerate(_test_pairs(lesson)):
         rng = np.random.default_rng([17, index])
         for row in np.flatnonzero(pair.unseen)[:frames]:
-            vertices = pair.posed(pair.unposed[[row]], lesson.skin_weights)[0]
+            transforms = with_pose(pair.person, pair.rotations[row], STILL).transforms
+            vertices = skin(pair.unposed[row].astype(np.float64), lesson.skin_weights, transforms)
             seen = _seen(garment, pair, int(row), vertices)
             begun = time.process_time()
             fit = fit_style(garment, [seen])
