@@ -68,7 +68,11 @@ def run(
         lesson = style_lesson(read_style_set(folder))
         predictions, note, garment = _predictions(lesson, paper=paper)
         notes.append(note)
-        for metric in (*prototype_metrics(lesson), *frame_metrics(garment, lesson), *fit_metrics(garment, lesson)):
+        for metric in (
+            *prototype_metrics(lesson),
+            *frame_metrics(garment, lesson),
+            *fit_metrics(garment, lesson, frames=1 if quick else 3),
+        ):
             use.setdefault(metric.key, []).append(metric)
         for name, predict in predictions.items():
             errors.setdefault(name, []).append(measure(lesson, predict))

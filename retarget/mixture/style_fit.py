@@ -7,7 +7,7 @@ Letters: N points of a frame, P numbers of style and shape, phi, from -1 to 1.
 
 The energy of some frames together, phi shared:
 
-    mean_n rho(|r_n| / SPREAD_M)  +  NUMBERS_PRIOR |phi - phi_0|^2  +  POSE_PRIOR mean_j (turn_j / TURN_RAD)^2
+    mean_n rho(|r_n| / SPREAD_M)  +  sum_p prior_p (phi_p - phi_0p)^2  +  POSE_PRIOR mean_j (turn_j / TURN_RAD)^2
 
 r_n is a vertex minus where it was registered or, of a surface that has other vertices, the distance of one of its
 points along its normal and of a point on its border to the border of the same name. rho is Geman and McClure's. It is
@@ -44,7 +44,9 @@ SPREAD_M = 0.02
 """Residual from which a point counts less: a model of a dozen prototypes is off by 10 to 16 mm itself."""
 BORDER_SHARE = 0.3
 """Weight of all points on borders together, beside 1 of all others."""
-NUMBERS_PRIOR = 2e-4
+NUMBERS_PRIOR, TRACKED_PRIOR = 2e-4, 0.3
+"""Of a number that nobody knows, and of the shape of a person who was tracked: a garment says little of who is in it,
+and what a model of few prototypes gets wrong would be put down to the person."""
 POSE_PRIOR, TURN_RAD = 0.05, np.radians(3.0)
 """A joint that turns by this costs as much as a twentieth of the whole energy of points that are far off."""
 STEP, TURN_STEP, SHIFT_STEP = 0.02, 0.01, 1e-3
@@ -107,8 +109,8 @@ def fit_style(
     """Find the style and the person that explain what was seen in some frames.
 
     Args:
-        shape: of the person as tracked, standard deviations: where the search for it begins; what the garment was not
-            learned on is left out.
+        shape: of the person as tracked, standard deviations, from which the fit hardly moves; what the garment was not
+            learned on is left out. Empty if nobody was tracked: then the garment alone tells it, and not well.
         fit_pose: turn the joints that move the garment a little, if that explains more.
     Raises:
         InputError: there is nothing to fit to, or a frame's pose or vertices are not the model's.
@@ -202,6 +204,8 @@ class _Search:
     ) -> None:
         self.model, self.garment = _Model(garment), garment
         self.numbers = self.first = _begin(garment, shape)
+        styles = np.arange(len(self.first)) < len(garment.ranges.style)
+        self.priors = np.where(styles | (len(shape) == 0), NUMBERS_PRIOR, TRACKED_PRIOR)
         self.faces = garment.garment.template.faces
         self.joints = np.array([0, *garment.pose.joints])  # the root turns the garment as a whole
         self.frames = [self._placed(index, frame) for index, frame in enumerate(frames, 1)]
@@ -231,8 +235,8 @@ class _Search:
     def _step(self, stage: Stage) -> None:
         """One step; a frame's own unknowns are eliminated, for no other frame knows them."""
         size = len(self.numbers)
-        shared = NUMBERS_PRIOR * np.eye(size)
-        drawn = NUMBERS_PRIOR * (self.first - self.numbers)
+        shared = np.diag(self.priors)
+        drawn = self.priors * (self.first - self.numbers)
         own: list[tuple[_Placed, np.ndarray, np.ndarray, np.ndarray]] = []
         for placed in self.frames:
             squares, right = self._normal_equations(placed, stage)

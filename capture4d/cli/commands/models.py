@@ -175,7 +175,7 @@ class FitStyle(FileOptions):
     work: Annotated[Positional[Path], arg(metavar="WORK")]
     """Work folder of a take that was registered, or extracted and tracked, on the model's body."""
     output: Path
-    """style.json to write, for `animate --style @style.json`."""
+    """style.json to write, which `animate` takes for a style."""
     config: Annotated[mixture_config.StyleFitConfig, arg(name="")] = field(
         default_factory=mixture_config.StyleFitConfig
     )

@@ -86,6 +86,7 @@ def test_examples_are_understood(name: str):
 
 
 QUICK = {
+    "fit-style",
     "offsets draw",
     "offsets edit",
     "offsets apply",

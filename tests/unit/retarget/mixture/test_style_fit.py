@@ -124,10 +124,11 @@ def test_what_is_beyond_the_range_ends_at_it_and_says_so(garment: StyledGarment,
     assert (np.abs(fit.numbers) <= 1 + 1e-9).all()
 
 
-def test_the_search_begins_with_the_tracked_person(garment: StyledGarment, saw: Saw):
-    """More components than were learned are left out, and one beyond the range is brought to its end."""
-    fit = fit_style(garment, [saw(0.7, 0.9, 0.3)], shape=(5.0, 1.0, 1.0), fit_pose=False)
-    assert fit.beta[0] == pytest.approx(0.9, abs=0.03)
+def test_a_tracked_person_stays(garment: StyledGarment, saw: Saw):
+    """More components than were learned are left out, one beyond the range is brought to its end."""
+    fits = [fit_style(garment, [saw(0.7, 0.3, 0.3)], shape=shape, fit_pose=False) for shape in ((0.9, 1.0), (5.0,), ())]
+    assert [fit.beta[0] for fit in fits] == pytest.approx([0.9, 1.0, 0.3], abs=0.1)
+    assert [fit.style["length"] for fit in fits] == pytest.approx([0.7, 0.7, 0.7], abs=0.03)
 
 
 def test_what_cannot_be_fitted_is_one_line(garment: StyledGarment, saw: Saw, tmp_path: Path):

@@ -68,8 +68,8 @@ def test_the_style_of_registered_frames_is_found_and_worn_by_others(
     said = capsys.readouterr().out
     about = read_json(tmp_path / "style.json")
     assert about["style"]["length"] == pytest.approx(0.7, abs=0.02)
-    assert about["beta"][0] == pytest.approx(0.5, abs=0.4)  # 4 mm a unit, and cloth was taken out of the body
-    assert about["residual_mm"] < 2.0
+    assert about["beta"][0] == pytest.approx(0.5, abs=0.1)
+    assert about["residual_mm"] < 8.0
     assert about["source"] == "registration"
     assert about["verdict"] == "good"
     assert [*about["frames"]] == ["0", "1", "2", "3"]
