@@ -86,6 +86,7 @@ def test_examples_are_understood(name: str):
 
 
 QUICK = {
+    "tryon",  # a page, which says itself what it does
     "offsets draw",
     "offsets edit",
     "offsets apply",
