@@ -65,7 +65,7 @@ def served() -> Iterator[Callable[..., str]]:
     yield serve
     for each in running:
         each.kill()
-        each.wait()
+        each.communicate()
 
 
 @pytest.fixture

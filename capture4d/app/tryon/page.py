@@ -262,9 +262,7 @@ class TryOnPage:
                 number += 1
             self._written.content = f"writing {folder} …"
             result = self._session.export(folder)
-            self._written.content = (
-                f"{result.frames} frames in {folder}; `capture4d export {folder}` hands them on"
-            )
+            self._written.content = f"{result.frames} frames in {folder}; `capture4d export {folder}` hands them on"
         except (InputError, OSError) as error:
             self._written.content = f"⚠ {error}"
         finally:

@@ -1,6 +1,6 @@
 """A garment out of the body as fast as a slider moves: what `geometry.intersection_removal` does in twelve searches and
-hundreds of sweeps, in one or two searches and two steps. It keeps no edge to its length; when the pose rests, the exact
-removal takes over.
+hundreds of sweeps, in up to four searches with a step each. It keeps no edge to its length; when the pose rests, the
+exact removal takes over.
 """
 
 from __future__ import annotations
@@ -10,15 +10,17 @@ from jaxtyping import Float, Float64, Int32
 from scipy.sparse import csr_array
 
 from capture4d.body.limbs import WornBody
-from capture4d.geometry.intersection_removal import Contacts
+from capture4d.geometry.intersection_removal import NOISE_M, Contacts
 from capture4d.geometry.mesh import vertex_adjacency
 
 __all__ = ["LivePush"]
 
-SPREAD = 0.5
-"""Share of the way to its neighbours' mean displacement that each vertex goes: without it the cloth is dented."""
-DEEP_M = 0.004
-"""What was deeper than this is looked at again: the nearest skin is another one from outside."""
+SPREADS = (0.5, 0.25, 0.1, 0.0)
+"""Share of the way to its neighbours' mean displacement that each vertex goes, step by step. Without it the cloth is
+dented, and in a crease a vertex is sent from one side into the other; with the same share in every step it is drawn
+back in (docs/notebook/tryon.md)."""
+LEFT_M = 0.0008
+"""No step more where nothing is deeper than this."""
 
 
 class LivePush:
@@ -31,8 +33,8 @@ class LivePush:
 
     def __init__(self, worn: WornBody, faces: Int32[np.ndarray, "faces 3"], count: int, margin_m: float) -> None:
         adjacency = vertex_adjacency(faces, count)
-        degree = np.maximum(np.diff(adjacency.indptr), 1)
-        share = np.repeat(1.0 / degree, np.diff(adjacency.indptr))
+        degree = np.diff(adjacency.indptr)
+        share = np.repeat(1.0 / np.maximum(degree, 1), degree)
         self._mean = csr_array((share, adjacency.indices, adjacency.indptr), shape=adjacency.shape)
         self._worn, self._margin = worn, margin_m
 
@@ -45,19 +47,15 @@ class LivePush:
             skin: the posed body's vertices.
         """
         start = np.ascontiguousarray(vertices, np.float64)
-        body = self._worn.posed(skin)
-        found = body.contacts(start)
-        result = self._moved(start, start, found)
-        if float(found.depths.max(initial=0.0)) > DEEP_M:
-            result = self._moved(result, start, body.contacts(result))
+        body, result = self._worn.posed(skin), start
+        for step, spread in enumerate(SPREADS):
+            found = body.contacts(result)
+            if float(found.depths.max(initial=0.0)) <= (LEFT_M if step else NOISE_M):
+                break
+            displaced = self._held(result, found) - start
+            displaced += spread * (self._mean @ displaced - displaced)
+            result = self._held(start + displaced, found)
         return result
-
-    def _moved(self, points: np.ndarray, start: np.ndarray, found: Contacts) -> np.ndarray:
-        """Between their bounds, their displacements evened out, and between their bounds again."""
-        held = self._held(points, found)
-        displaced = held - start
-        displaced += SPREAD * (self._mean @ displaced - displaced)
-        return self._held(start + displaced, found)
 
     def _held(self, points: np.ndarray, found: Contacts) -> np.ndarray:
         """Over the limb that carries them, and not in another, as far as planes at their feet tell."""

@@ -18,6 +18,7 @@ from capture4d.errors import InputError
 from capture4d.files.records import save_poses
 from capture4d.geometry.intersection_removal import Penetration
 from capture4d.motions.motion_files import read_motion, told
+from capture4d.runs.progress import progress_style
 from capture4d.runs.stage import StageResult
 from capture4d.types import Mesh, PoseSequence
 from retarget.animation.stage import Wearer
@@ -199,4 +200,5 @@ class Session:
         motion = folder / "motion.npz"
         save_poses(motion, replace(poses, shape=np.asarray(self._fitting.worn.person.shape, np.float32)))
         wearer = Wearer(beta=tuple(self.beta), style=dict(self.style) or None)
-        return animate(self.tried.path, motion, folder, AnimateConfig(), wearer=wearer)
+        with progress_style("quiet"):  # whoever asked for it looks at a page
+            return animate(self.tried.path, motion, folder, AnimateConfig(), wearer=wearer)

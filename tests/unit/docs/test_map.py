@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).parents[3]
 PACKAGES = ("capture4d", "data_synth", "registration", "retarget", "wrinkles")
 CONTRIBUTING = (ROOT / "CONTRIBUTING.md").read_text()
-TO_COME = CONTRIBUTING[CONTRIBUTING.index("Rooms for what comes") : CONTRIBUTING.index("### Where is it?")]
+TO_COME = next((line for line in CONTRIBUTING.splitlines() if line.startswith("Rooms for what comes")), "")
 MAP = CONTRIBUTING.replace(TO_COME, "")
 DOTTED = re.compile(rf"`((?:{'|'.join((*PACKAGES, 'benchmarks'))})(?:\.\w+)+)`")
 

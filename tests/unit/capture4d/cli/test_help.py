@@ -87,6 +87,7 @@ def test_examples_are_understood(name: str):
 
 QUICK = {
     "fit-style",
+    "tryon",  # a page, which says itself what it does
     "offsets draw",
     "offsets edit",
     "offsets apply",
