@@ -28,6 +28,7 @@ from capture4d.captures.work_folder import WorkFolder, load_registration
 from capture4d.errors import InputError
 from capture4d.files.arrays import ArrayFile, map_array
 from capture4d.files.atomic import read_json, write_bytes, write_json, write_npy, write_npz
+from capture4d.geometry.islands.map_seams import find_gutter
 from capture4d.geometry.mesh import face_areas
 from capture4d.geometry.uv_raster import UvRaster, rasterise_uv
 from capture4d.runs.frame_lists import frame_file
@@ -129,7 +130,9 @@ def _chosen(work: WorkFolder, most: int) -> list[int]:
 
 
 def _raster(mesh: Mesh, texels: int) -> UvRaster:
-    return rasterise_uv(mesh, texels, padding=max(2, texels // 256))
+    """Texels and what they show; beyond a seam that is the cloth across it."""
+    bare = rasterise_uv(mesh, texels, padding=max(2, texels // 256))
+    return find_gutter(mesh, bare).shown_by(bare)
 
 
 # --- the light ---------------------------------------------------------------------------------------------------
