@@ -38,14 +38,14 @@ from capture4d.runs.stage import Stage, StageResult, open_stage, require_complet
 from capture4d.runs.workers import run_jobs, shared
 from capture4d.texturing.baking import BESIDE_BORDER, ColouredScan, as_bytes, surface_blocks
 from capture4d.texturing.blending import blend, fill_holes, spread_out
-from capture4d.texturing.config import TextureConfig
+from capture4d.texturing.config import ALBEDO, TEMPLATE, TEXTURE, TextureConfig
 from capture4d.texturing.light import BRIGHTEST, Light, fit_light
 from capture4d.types import GarmentScan, Mesh
 
-__all__ = ["ALBEDO", "TEMPLATE", "TEXTURE", "run"]
+__all__ = ["run"]
 
 SCHEMA = 1
-TEXTURE, ALBEDO, SEEN, TEMPLATE = "texture", "albedo.png", "seen.png", "template.npz"
+SEEN = "seen.png"
 LIGHT_TEXELS, LIGHT_PLACES = 192, 6000
 """Of the picture on which the light is found, and how many of its texels are looked at."""
 

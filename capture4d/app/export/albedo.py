@@ -17,7 +17,7 @@ from capture4d.files.records import load_garment
 from capture4d.geometry.uv_raster import rasterise_uv
 from capture4d.runs.stage import read_record
 from capture4d.texturing.blending import spread_out
-from capture4d.texturing.stage import ALBEDO, TEMPLATE, TEXTURE
+from capture4d.texturing.config import ALBEDO, TEMPLATE, TEXTURE
 from capture4d.types import Garment, Mesh
 
 __all__ = ["Albedo", "find_albedo", "write_albedo"]
