@@ -23,9 +23,10 @@ from capture4d.app.onnx_models.config import OnnxConfig
 from capture4d.app.onnx_models.stage import FILE, Compared
 from capture4d.body.anny import load_anny
 from capture4d.files.records import load_garment
+from capture4d.geometry.ray_casting import closest_points
 from capture4d.geometry.uv_layout import unit_square
 from capture4d.templates.config import TemplateConfig
-from capture4d.types import Garment
+from capture4d.types import Body, Garment
 from retarget.config import LstmConfig
 from wrinkles.normal_maps.config import PRESETS, MapConfig
 from wrinkles.normal_maps.inference import WrinkleModel, generator_path, save_model
@@ -48,7 +49,7 @@ def run(*, quick: bool = False, seed: int = 0) -> list[Metric]:
         pipeline.template(None, root / "template.npz", TemplateConfig(region="tshirt"))
         garment, body = load_garment(root / "template.npz"), load_anny()
         bound = replace(garment, body_shape=np.zeros(len(body.shape_directions), np.float32))
-        shirt = bound if quick else finer(bound)
+        shirt = bound if quick else _bound(finer(bound), body)
         network = LstmConfig(size=32) if quick else LstmConfig()
         shapes, frames = (10, 100) if quick else (60, 600)
         model = garment_model(body, shirt, rng, shapes=shapes, frames=frames, network=network)
@@ -61,6 +62,12 @@ def run(*, quick: bool = False, seed: int = 0) -> list[Metric]:
         config = OnnxConfig(probes=8 if quick else 32)
         metrics += _told("wrinkles", pipeline.export_onnx(root / "network", place, config)[1], place)
     return metrics
+
+
+def _bound(garment: Garment, body: Body) -> Garment:
+    """To the nearest faces of the body."""
+    _, faces, barycentric = closest_points(body.template, garment.template.vertices)
+    return replace(garment, embedding_faces=faces, embedding_barycentric=barycentric.astype(np.float32))
 
 
 def _write_network(folder: Path, garment: Garment, quick: bool, seed: int) -> None:

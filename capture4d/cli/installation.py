@@ -33,6 +33,8 @@ State = Literal["found", "missing", "broken", "other version"]
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 OPTIONAL = {
     "alembic3d": "`export --format abc`",
+    "onnx": "`export-onnx`",
+    "onnxruntime": "`export-onnx`",
     "meshmonk": "a peer of `python -m benchmarks registration`",
     "usd-core": "`export --format usd`",
     "viser": "`view` and `tryon`",

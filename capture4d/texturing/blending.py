@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import cv2
 import numpy as np
@@ -77,8 +78,9 @@ def fill_holes(
     if seen.all() or not seen.any():
         return
     tree = KDTree(places[seen])
-    distance, near = tree.query(places[~seen], k=min(NEIGHBOURS, int(seen.sum())))
-    distance, near = distance.reshape(len(distance), -1), near.reshape(len(near), -1)
+    holes = places[~seen]
+    found: Any = tree.query(holes, k=min(NEIGHBOURS, int(seen.sum())))
+    distance, near = (each.reshape(len(holes), -1) for each in found)
     share = 1 / np.maximum(distance, 1e-6)
     share /= share.sum(axis=1, keepdims=True)
     colours[~seen] = np.einsum("nk,nkc->nc", share, colours[seen][near])
@@ -91,9 +93,9 @@ def spread_out(
     background."""
     if known.all():
         return picture
-    _, label = cv2.distanceTransformWithLabels(
+    label: Any = cv2.distanceTransformWithLabels(
         (~known).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
-    )
+    )[1]
     colour_of = np.zeros((int(label.max()) + 1, 3), np.uint8)
     colour_of[label[known]] = picture[known]
     return colour_of[label]

@@ -1,4 +1,4 @@
-"""Settings of `texture`. Standard library alone: `capture4d --help` loads it."""
+"""Settings of `texture`, and the names of what it writes. Standard library alone: `capture4d --help` loads it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ from typing import Annotated
 
 from capture4d.settings import Positive, Range, settings
 
-__all__ = ["TextureConfig"]
+__all__ = ["ALBEDO", "TEMPLATE", "TEXTURE", "TextureConfig"]
+
+TEXTURE, ALBEDO, TEMPLATE = "texture", "albedo.png", "template.npz"
+"""Folder of the texture in WORK, the picture, and the garment over whose UVs it lies."""
 
 
 @settings

@@ -4,6 +4,7 @@ stage.json     what was made, and from what
 light.npz      how bright the cloth was by the direction in which it faces
 albedo.png     sRGB over the template's UVs, as `--print` takes it
 seen.png       white where any frame has seen the cloth
+template.npz   the garment over whose UVs they lie
 texture.json   how much of it was seen, and by how much frames differ
 
 The light is found first, on a small picture of all frames; then the colours of each frame are baked, without the light,
@@ -28,6 +29,8 @@ from capture4d.captures.work_folder import WorkFolder, load_registration
 from capture4d.errors import InputError
 from capture4d.files.arrays import ArrayFile, map_array
 from capture4d.files.atomic import read_json, write_bytes, write_json, write_npy, write_npz
+from capture4d.files.records import save_garment
+from capture4d.geometry.islands.map_seams import find_gutter
 from capture4d.geometry.mesh import face_areas
 from capture4d.geometry.uv_raster import UvRaster, rasterise_uv
 from capture4d.runs.frame_lists import frame_file
@@ -35,14 +38,14 @@ from capture4d.runs.stage import Stage, StageResult, open_stage, require_complet
 from capture4d.runs.workers import run_jobs, shared
 from capture4d.texturing.baking import BESIDE_BORDER, ColouredScan, as_bytes, surface_blocks
 from capture4d.texturing.blending import blend, fill_holes, spread_out
-from capture4d.texturing.config import TextureConfig
+from capture4d.texturing.config import ALBEDO, TEMPLATE, TEXTURE, TextureConfig
 from capture4d.texturing.light import BRIGHTEST, Light, fit_light
 from capture4d.types import GarmentScan, Mesh
 
-__all__ = ["ALBEDO", "TEXTURE", "run"]
+__all__ = ["run"]
 
 SCHEMA = 1
-TEXTURE, ALBEDO, SEEN = "texture", "albedo.png", "seen.png"
+SEEN = "seen.png"
 LIGHT_TEXELS, LIGHT_PLACES = 192, 6000
 """Of the picture on which the light is found, and how many of its texels are looked at."""
 
@@ -97,7 +100,7 @@ def run(work: WorkFolder, config: TextureConfig, *, workers: int = 1, overwrite:
         work.path / TEXTURE, name="texture", schema=SCHEMA, config=config, upstream=upstream,
         sources={"work": work.path}, overwrite=overwrite,
     )  # fmt: skip
-    paths = [stage.path / ALBEDO, stage.path / "light.npz"]
+    paths = [stage.path / name for name in (ALBEDO, "light.npz", TEMPLATE)]
     if not (stage.was_complete and all(path.is_file() for path in paths)):
         light, gains = _light(take, chosen, stage.path / "light.npz", workers)
         missing = stage.pending(chosen, ".npy")
@@ -105,6 +108,7 @@ def run(work: WorkFolder, config: TextureConfig, *, workers: int = 1, overwrite:
         for _ in run_jobs(_bake, missing, prepare=prepare, workers=workers, label="texture"):
             pass
         _put_together(take, stage, chosen, light)
+        save_garment(stage.path / TEMPLATE, garment)
         shutil.rmtree(stage.path / "frames", ignore_errors=True)
     return stage.finish(paths, frames=len(chosen))
 
@@ -129,7 +133,9 @@ def _chosen(work: WorkFolder, most: int) -> list[int]:
 
 
 def _raster(mesh: Mesh, texels: int) -> UvRaster:
-    return rasterise_uv(mesh, texels, padding=max(2, texels // 256))
+    """Texels and what they show; beyond a seam that is the cloth across it."""
+    bare = rasterise_uv(mesh, texels, padding=max(2, texels // 256))
+    return find_gutter(mesh, bare).shown_by(bare)
 
 
 # --- the light ---------------------------------------------------------------------------------------------------

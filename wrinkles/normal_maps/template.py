@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
+from capture4d.geometry.islands.map_seams import Gutter, SeamTable, find_gutter, seam_table
 from capture4d.geometry.mesh import normalised, vertex_normals
 from capture4d.geometry.tangents import TangentLayout, frames_at
 from capture4d.geometry.uv_layout import unit_square
@@ -17,7 +18,6 @@ from capture4d.geometry.uv_raster import UvRaster, rasterise_uv
 from capture4d.types import Garment, Mesh
 from wrinkles.normal_maps.config import MapConfig, ProjectionConfig
 from wrinkles.normal_maps.scan_normals import TexelNormals, combine_frames, project_scan
-from wrinkles.normal_maps.seams import Gutter, SeamTable, find_gutter, seam_table
 from wrinkles.normal_maps.spaces import garment_rotation, to_tangent
 
 __all__ = ["FramePair", "MapTemplate", "frame_pairs", "temporal_window"]

@@ -13,10 +13,11 @@ from capture4d.captures.work_folder import WorkFolder
 from capture4d.errors import InputError
 from capture4d.files.atomic import file_digest, write_bytes
 from capture4d.files.pictures import picture_pixels, read_picture
+from capture4d.files.records import load_garment
 from capture4d.geometry.uv_raster import rasterise_uv
 from capture4d.runs.stage import read_record
 from capture4d.texturing.blending import spread_out
-from capture4d.texturing.stage import ALBEDO, TEXTURE
+from capture4d.texturing.config import ALBEDO, TEMPLATE, TEXTURE
 from capture4d.types import Garment, Mesh
 
 __all__ = ["Albedo", "find_albedo", "write_albedo"]
@@ -33,7 +34,7 @@ class Albedo:
     path: Path
     digest: str
     garment: Garment
-    """Over whose UVs it lies, as `picture_span` says."""
+    """Over whose UVs it lies, as `picture_span` says: that of the template beside it, if there is one."""
 
 
 def find_albedo(work: WorkFolder, garment: Garment, given: str | None, notes: list[str]) -> Albedo | None:
@@ -43,7 +44,7 @@ def find_albedo(work: WorkFolder, garment: Garment, given: str | None, notes: li
         given: path of a picture, or "none".
         notes: what is worth telling is added.
     Raises:
-        InputError: there is no such picture, or the template has no UVs to lay it over.
+        InputError: there is no such picture, it is of another template, or the template has no UVs to lay it over.
     """
     if given == NONE:
         return None
@@ -59,7 +60,11 @@ def find_albedo(work: WorkFolder, garment: Garment, given: str | None, notes: li
         raise InputError("no such picture of the cloth's colours", where=path)
     if garment.template.uv is None:
         raise InputError("expected a template with UVs under the picture of its colours, found none", where=work.path)
-    return Albedo(path, file_digest([path], root=path.parent), garment)
+    beside = path.with_name(TEMPLATE)
+    own = load_garment(beside) if beside.is_file() else garment
+    if not np.array_equal(own.template.faces, garment.template.faces):
+        raise InputError(f"expected a picture over the UVs of {work.path}, found one of another template", where=path)
+    return Albedo(path, file_digest([path], root=path.parent), own)
 
 
 def write_albedo(path: Path, albedo: Albedo, mesh: Mesh) -> None:

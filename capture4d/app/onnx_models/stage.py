@@ -278,8 +278,8 @@ def _compared(path: Path, task: _Task, probes: int) -> Compared:
         raise InputError(f"read back: expected {wanted.shape}, found {found.shape}", where=path)
     unit = "deg" if task.output == "high" else "mm"
     away = _angles(found, wanted) if unit == "deg" else 1e3 * np.linalg.norm(found - wanted, axis=-1)
-    times = [1e3 * _seconds(call) / probes for call in (answered, task.timed)]
-    return Compared(task.kind, float(away.max()), float(away.mean()), unit, *times, task.by)
+    onnx_ms, ours_ms = (1e3 * _seconds(call) / probes for call in (answered, task.timed))
+    return Compared(task.kind, float(away.max()), float(away.mean()), unit, onnx_ms, ours_ms, task.by)
 
 
 def _angles(found: np.ndarray, wanted: np.ndarray) -> np.ndarray:

@@ -103,12 +103,12 @@ class Export(_Alone):
 
 
 def _parts(said: str) -> list[Along]:
-    found: list[Along] = []
-    for word in filter(None, (part.strip() for part in said.split(","))):
-        if word not in get_args(Along):
-            raise CommandLineError(f"--with: expected scans, body or both, found '{word}'")
-        found.append(word)
-    return found
+    known: dict[str, Along] = {each: each for each in get_args(Along)}
+    words = [*filter(None, (part.strip() for part in said.split(",")))]
+    unknown = [word for word in words if word not in known]
+    if unknown:
+        raise CommandLineError(f"--with: expected scans, body or both, found '{unknown[0]}'")
+    return [known[word] for word in words]
 
 
 @dataclass(frozen=True, kw_only=True)

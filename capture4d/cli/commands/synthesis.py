@@ -202,10 +202,10 @@ def hand_on(work: Path, model: Path, albedo: Path, *, workers: int, overwrite: b
         albedo: what `texture` wrote.
     """
     from capture4d import pipeline
-    from capture4d.app.export.config import ExportConfig
+    from capture4d.app.export.config import ExportConfig, Format
     from capture4d.app.export.stage import default_format
 
     pipeline.wrinkles_apply(model, work, workers=workers, overwrite=overwrite)
-    formats = [default_format(), "html"]
+    formats: list[Format] = [default_format(), "html"]
     done = pipeline.export(work, formats, config=ExportConfig(albedo=str(albedo)), overwrite=overwrite)
     return done.result.path

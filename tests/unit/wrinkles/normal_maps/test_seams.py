@@ -9,12 +9,12 @@ import pytest
 
 from capture4d.errors import InputError
 from capture4d.files.pictures import holds_pixels
+from capture4d.geometry.islands.map_seams import seam_table
 from capture4d.geometry.uv_raster import rasterise_uv
 from capture4d.types import Garment, Mesh
 from tests.unit.wrinkles.conftest import wrinkle_normals
 from wrinkles.normal_maps.config import MapConfig
 from wrinkles.normal_maps.display import fill_holes
-from wrinkles.normal_maps.seams import seam_table
 from wrinkles.normal_maps.spaces import decode_png, encode_png, flip_green
 from wrinkles.normal_maps.template import MapTemplate
 

@@ -10,7 +10,7 @@ from capture4d.app.export.albedo import Albedo, write_albedo
 from capture4d.cli.exit_codes import GOOD
 from capture4d.files.atomic import read_json, write_bytes, write_json
 from capture4d.files.pictures import read_picture
-from capture4d.files.records import load_garment
+from capture4d.files.records import load_garment, save_garment
 from capture4d.mesh_files.animated.optional_packages import USD, is_installed, package_module
 from capture4d.mesh_files.gltf.accessors import accessor_values
 from capture4d.mesh_files.gltf.document import open_document
@@ -95,6 +95,17 @@ def test_one_of_an_earlier_registration_is_left_out_and_one_that_is_given_is_tak
     write_json(work / "texture" / "stage.json", read_json(work / "texture" / "stage.json") | {"status": "running"})
     assert run("export", work, "--format", "pc2", "--output", work / "bare", "--quiet") == GOOD
     assert "albedo" not in read_json(work / "bare" / "stage.json")["upstream"]
+
+
+def test_a_picture_of_another_template_is_refused(work: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    picture(tmp_path / "albedo.png")
+    mesh = cloth()
+    fewer = mesh.uv[1:] if mesh.uv is not None else None
+    save_garment(tmp_path / "template.npz", Garment(Mesh(mesh.vertices, mesh.faces[1:], fewer)))
+    said = fails(capsys, "export", work, "--format", "pc2", "--albedo", tmp_path / "albedo.png")
+    assert "found one of another template" in said
+    save_garment(tmp_path / "template.npz", Garment(mesh))
+    assert run("export", work, "--format", "pc2", "--albedo", tmp_path / "albedo.png", "--quiet") == GOOD
 
 
 def test_over_other_uvs_each_place_keeps_its_colour(work: Path, tmp_path: Path):

@@ -1,0 +1,1 @@
+"""Islands of UVs: what a map shows where two of them share an edge of the cloth."""
