@@ -181,8 +181,8 @@ class WornGarment:
     ) -> Float64[np.ndarray, "verts 3"]:
         """The garment in a pose, metres, as fast as a picture is drawn.
 
-        It is pushed out of the limbs that carry it, which leaves a few tenths of a percent inside; `outside` leaves next
-        to nothing and takes forty times as long.
+        It is pushed out of the limbs that carry it, which leaves a few tenths of a percent inside; `outside` leaves
+        next to nothing and takes forty times as long.
         """
         if self._near is None:
             garment, config = self._garment.garment, self._config
