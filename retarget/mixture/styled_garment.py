@@ -189,8 +189,11 @@ class WornGarment:
     def live(
         self, rotations: Float[np.ndarray, "joints 3 3"], translation: Float[np.ndarray, "3"]
     ) -> Float64[np.ndarray, "verts 3"]:
-        """The garment in a pose, metres, as fast as a picture is drawn: pushed out of the limbs that carry it, which
-        leaves a few tenths of a percent inside, where `outside` leaves next to nothing and takes forty times as long."""
+        """The garment in a pose, metres, as fast as a picture is drawn.
+
+        It is pushed out of the limbs that carry it, which leaves a few tenths of a percent inside; `outside` leaves
+        next to nothing and takes forty times as long.
+        """
         if self._near is None:
             garment, config = self._garment.garment, self._config
             assert garment.skin_weights is not None
