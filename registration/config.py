@@ -410,6 +410,8 @@ class ScanFitConfig:
     lost_fail_percent: Percent = 5.0
     """The same above which it has failed, where the scan is doubtfully reached as well: a limb went elsewhere. Where
     all of the scan is reached, it only shows less."""
+    lost_swung_fail_percent: Percent = 25.0
+    """The same above which it has failed, where it has swung by more than `swung_check_mm` as well: another thing."""
     swung_check_mm: NonNegative = 45.0
     """Mean way of the template's vertices from the start, beyond the best rigid motion, above which the result is to be
     checked: how limbs have turned and slid under their clothes is known less well the farther they have swung."""

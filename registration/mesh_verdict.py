@@ -63,6 +63,9 @@ def judge(
     swung = 1e3 * float(np.linalg.norm(vertices - rigid, axis=1).mean())
     lost = 100.0 * float((1e3 * scan.surface.grid.query(vertices)[0] > config.far_fail_mm).mean())
     unreached = mean > config.check_mm + facets or far > config.far_check_mm + facets
+    lost_limit = config.lost_fail_percent if unreached else np.inf
+    if swung > config.swung_check_mm:  # what little is seen was brought there from far away
+        lost_limit = min(lost_limit, config.lost_swung_fail_percent)
     share = 100.0 / max(len(analysis.faces), 1)
     flipped, cut = quality.numbers["flipped_faces"] * share, quality.numbers["self_intersections"] * share
     failed, check = [], []
@@ -74,7 +77,7 @@ def judge(
             "share of the template far from the scan",
             lost,
             config.lost_check_percent,
-            config.lost_fail_percent if unreached else np.inf,
+            lost_limit,
             " %",
         ),
         ("mean way beyond a rigid motion", swung, config.swung_check_mm, np.inf, " mm"),

@@ -40,11 +40,12 @@ def test_what_has_swung_is_to_be_checked(move, doubted: bool, garment, scan_of, 
     assert verdict != "failed"
 
 
-@pytest.mark.parametrize(("off", "lost"), [(0.004, True), (0.0, False)])
+@pytest.mark.parametrize(("off", "swing_mm", "lost"), [(0.004, 500.0, True), (0.0, 500.0, False), (0.0, 45.0, True)])
 def test_a_part_that_went_elsewhere_has_failed_and_what_is_not_scanned_is_to_be_checked(
-    off: float, lost: bool, garment, scan_of, config
+    off: float, swing_mm: float, lost: bool, garment, scan_of, config
 ) -> None:
-    """The scan shows the lower part; the upper one lies elsewhere, and the rest upon the scan, or 4 mm beside it."""
+    """The scan shows the lower part; the upper one lies elsewhere, and the rest upon the scan, or 4 mm beside it. What
+    has swung too far for a part of the same thing has failed in any case."""
     analysis = analyse_template(garment, config)
     whole = scan_of(lambda points: points)
     lower = whole.mesh.faces[(whole.mesh.vertices[whole.mesh.faces, 1] < 0.3).all(axis=1)]
@@ -54,7 +55,8 @@ def test_a_part_that_went_elsewhere_has_failed_and_what_is_not_scanned_is_to_be_
     vertices = analysis.rest + off * mesh_normals(analysis.rest, analysis.faces)
     vertices[analysis.rest[:, 1] > 0.32, 0] += 0.3
     quality = replace(assess(analysis, scan, vertices, config.quality), verdict="good", reasons=())
-    verdict, reasons = judge(quality, analysis, scan, vertices, ScanFitConfig(), start=analysis.rest)
+    limits = ScanFitConfig(swung_check_mm=swing_mm)
+    verdict, reasons = judge(quality, analysis, scan, vertices, limits, start=analysis.rest)
     assert verdict == ("failed" if lost else "check")
     assert any("far from the scan" in reason for reason in reasons)
 
