@@ -67,7 +67,7 @@ def run(
     names = names if garment is None else [garment]
     counts = (4, 2) if quick else (poses, pairs)
     vertices: dict[GarmentName, int] = {name: VERTICES.get(name, 3000) // (3 if quick else 1) for name in names}
-    rows: list[tuple[GarmentName, dict[str, tuple[float, str]]]] = []
+    rows: list[tuple[str, dict[str, tuple[float, str]]]] = []
     if counts[0]:
         configs = [DrapesConfig(garment=name, vertices=vertices[name], seed=seed, samples=counts[0]) for name in names]
         measure = partial(_measure, pairs=counts[1], simulator=simulator)

@@ -150,7 +150,7 @@ class SolverConfig:
     """Share of the velocity that is left after a substep."""
     calm_after_frames: Whole = 16
     """Sixtieths of a second after which every further one damps as much more: what is pinched in a crease of the body
-    never rests by itself."""
+    never rests by itself. Twice as many for what is pinned, and swings."""
     margin_m: NonNegative = 0.005
     """Distance at which the cloth lies over the body, metres; that of the moving simulator."""
 

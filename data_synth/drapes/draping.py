@@ -225,11 +225,11 @@ class _Fitting:
         surface = self.parts.posed(body)
         hold = skin(worn.rest, worn.skin_weights, body.transforms), worn.gain
         solver, motion = self.solver, np.inf
-        frames = 0
+        frames, calm_after = 0, solver.calm_after_frames * (2 if self.kind.pinned else 1)
         wearing.begin_again(positions, surface)
         while motion >= solver.still_mm and frames < solver.frames:
             before = positions.copy()
-            keep = solver.keep - (1 - solver.keep) * max(0, frames - solver.calm_after_frames)
+            keep = solver.keep - (1 - solver.keep) * max(0, frames - calm_after)
             for _ in range(0, FRAME_SUBSTEPS, solver.contact_substeps):
                 planes = wearing.look_up(positions, surface)
                 advance(

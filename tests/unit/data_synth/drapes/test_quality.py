@@ -48,7 +48,8 @@ def box(size: tuple[float, float, float], centre: tuple[float, float, float]) ->
     """A cube's surface scaled and moved: vertices (8, 3), outward faces (12, 3)."""
     hull = ConvexHull(np.array(list(product((-0.5, 0.5), repeat=3))))
     faces = hull.simplices.copy()
-    normals = np.cross(*(hull.points[faces[:, k]] - hull.points[faces[:, 0]] for k in (1, 2)))
+    first, second = (hull.points[faces[:, k]] - hull.points[faces[:, 0]] for k in (1, 2))
+    normals = np.cross(first, second)
     flipped = (normals * hull.equations[:, :3]).sum(axis=1) < 0
     faces[flipped] = faces[flipped][:, ::-1]
     return hull.points * size + centre, faces
