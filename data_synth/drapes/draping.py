@@ -225,7 +225,7 @@ class _Fitting:
         surface = self.parts.posed(body)
         hold = skin(worn.rest, worn.skin_weights, body.transforms), worn.gain
         solver, motion = self.solver, np.inf
-        frames, calm_after = 0, solver.calm_after_frames * (2 if self.kind.pinned else 1)
+        frames, calm_after = 0, solver.frames if self.kind.pinned else solver.calm_after_frames
         wearing.begin_again(positions, surface)
         while motion >= solver.still_mm and frames < solver.frames:
             before = positions.copy()
