@@ -31,6 +31,9 @@ CLOSING_FRAMES, CLOSING_KEEP = 60, 0.95
 OUT_MARGINS, EXACT = (0.5, 0.45, 0.4, 0.35, 0.3, 0.25, 0.2, 0.15), (3, 7)
 """Shares of the margin to which vertices are pushed out of the body at the end, in turn with lengths and areas kept,
 and the turns in which the nearest skin is looked for everywhere. What the one undoes of the other gets less."""
+SWINGING_KEEP = 0.994
+"""Share of the velocity that a substep leaves to what is pinned: a pendulum of half a metre is damped critically, and
+with less left it creeps."""
 WEIGHT_SMOOTHING = 20
 """Further diffusion steps on skin weights: places that bend over a wider stretch do not crumple what they hold."""
 OFFSET_SMOOTHING = 12
@@ -225,11 +228,12 @@ class _Fitting:
         surface = self.parts.posed(body)
         hold = skin(worn.rest, worn.skin_weights, body.transforms), worn.gain
         solver, motion = self.solver, np.inf
-        frames, calm_after = 0, solver.calm_after_frames * (2 if self.kind.pinned else 1)
+        keeps = SWINGING_KEEP if self.kind.pinned else solver.keep
+        frames, calm_after = 0, solver.frames if self.kind.pinned else solver.calm_after_frames
         wearing.begin_again(positions, surface)
         while motion >= solver.still_mm and frames < solver.frames:
             before = positions.copy()
-            keep = solver.keep - (1 - solver.keep) * max(0, frames - calm_after)
+            keep = keeps - (1 - keeps) * max(0, frames - calm_after)
             for _ in range(0, FRAME_SUBSTEPS, solver.contact_substeps):
                 planes = wearing.look_up(positions, surface)
                 advance(

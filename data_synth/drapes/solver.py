@@ -33,9 +33,6 @@ FRAME_SUBSTEPS = 24
 GRAVITY = 9.81
 OUTWARDS_M = 0.002
 """A substep pushes a vertex no farther out of the body: what is deep inside comes out in several, and is not thrown."""
-OVERSHOOT = 1.5
-"""Of the correction of stretched edges. One sweep a step leaves a hanging sheet longer than its stiffness would, a
-shirt by 9 mm; successive over-relaxation brings it there sooner. 1.3 leaves 5 mm, 1.9 takes three times as long."""
 AREA_LIMITS = (0.45, 1.6)
 """Shares of its area within which a face ends: a sliver has edges of about their lengths, and no area."""
 FARTHEST_M = 0.005
@@ -85,7 +82,7 @@ class Sheet:
         edges, lengths = edges[edge_order], lengths[edge_order]
         both = inverse_masses[edges].sum(axis=1)
         gives = 1 / (np.array([cloth.stretch_stiffness, np.inf, cloth.compression_stiffness]) * SUBSTEP_S**2)
-        firmness = np.array([OVERSHOOT, 1.0, 1.0]) / np.maximum(both[:, None] + gives, 1e-9)
+        firmness = np.array([cloth.over_relaxation, 1.0, 1.0]) / np.maximum(both[:, None] + gives, 1e-9)
         firmness[both == 0] = 0
         stencils, weights = stencils[hinge_order], weights[hinge_order, :4]
         # Energy of a hinge: 3 k / (A1 + A2) times half the squared stencil; A from the faces around its corners.
