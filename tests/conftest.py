@@ -11,7 +11,7 @@ import pytest
 _ROOT = Path(__file__).parents[1]
 # tyro puts its own placeholders into the fields of a command that are still to be given, and the front door names
 # types that are not loaded before they are needed.
-_UNCHECKED = ("capture4d.cli.", "capture4d.pipeline", "capture4d.synthetic", "capture4d.one_shot")
+_UNCHECKED = ("capture4d.cli.", "capture4d.pipeline", "capture4d.steps", "capture4d.one_shot")
 
 
 def _install_shape_checks() -> None:
