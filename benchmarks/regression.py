@@ -22,11 +22,11 @@ from rich.console import Console
 
 from benchmarks.learning_takes import Lesson, lesson, training_set
 from benchmarks.metric import Metric
+from capture4d.captures.animations.known_poses import nearest_poses, pose_quaternions
 from retarget.config import FitConfig, LstmConfig
 from retarget.regression.controls import ControlLayout
 from retarget.regression.ensemble import ensemble
 from retarget.regression.kernel import fit_kernel
-from retarget.regression.known_range import nearest_poses, pose_quaternions
 from retarget.regression.learning import (
     Projected,
     fitting_clips,

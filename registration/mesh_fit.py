@@ -34,7 +34,7 @@ from capture4d.errors import InputError
 from capture4d.types import Garment, GarmentScan
 from registration.alignment import align, fit_similarity
 from registration.approach import approach, spread_evenly
-from registration.config import ApproachConfig, MeshRegistrationConfig, RegistrationConfig
+from registration.config import ApproachConfig, MeshRegistrationConfig, RegistrationConfig, Schedule
 from registration.correspondences import mesh_normals
 from registration.geodesic_signature import Likeness, geodesic_signatures, likeness
 from registration.limb_twist import untwisted
@@ -74,6 +74,10 @@ MOST_LOST = 0.2
 """Share of the template that may be far from a scan of another size; of half a person it is half."""
 PART_LOST = 0.01
 """Share of the template away from the scan by which a hand may be lost: the way from afar is tried as well."""
+SETTLED = 0.006
+"""Mean distance of what has settled from the scan, metres, beyond which its lengths keep it from there: what follows is
+loose then, from a wide gate."""
+LOOSE = Schedule(8, (0.03, 0.012), smooth=(2.0, 0.2), stretch=(10.0, 0.03), boundary=(0.3, 0.05))
 FROM_AFAR = ("far", "again", "wide")
 """Ways by `approach`."""
 FREE = ("sized", "soft")
@@ -233,9 +237,10 @@ def _keeping_lengths(tried: _Attempts, start: np.ndarray, landmarks: Landmarks |
     own = config.registration
 
     def placed(there: np.ndarray, *, turning: bool) -> np.ndarray:
-        return register_frame(
-            analysis, scan, _settled(tried, there, turning=turning), config=_dense_alone(own)
-        ).vertices
+        settled = _settled(tried, there, turning=turning)
+        lies = float(scan.surface.grid.query(settled)[0].mean()) <= SETTLED
+        dense = own if lies else replace(own, dense=replace(own.dense, cold=LOOSE))
+        return register_frame(analysis, scan, settled, config=_dense_alone(dense)).vertices
 
     def carried(begin: np.ndarray) -> np.ndarray:
         there = register_frame(analysis, scan, begin, config=_coarse_alone(own)).vertices

@@ -1,1 +1,1 @@
-"""Stages as functions, which `capture4d.pipeline` hands on under one name."""
+"""Stages as functions, which the pipeline hands on."""

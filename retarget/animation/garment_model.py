@@ -10,13 +10,14 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from capture4d.body.skinning import ShapedBody
+from capture4d.captures.animations.frame_files import FRAMES_AT_ONCE
 from capture4d.errors import InputError
 from capture4d.files.atomic import read_json
 from capture4d.files.reading import reading
 from capture4d.files.records import load_body
 from capture4d.runs.stage import read_record
 from capture4d.types import BlendshapeModel, Body, PoseSequence
-from retarget.animation.animator import FRAMES_AT_ONCE, Animator
+from retarget.animation.animator import Animator
 from retarget.animation.bodies import captured_person, person_of_shape, require_motion, retargeted_mean
 from retarget.config import AnimateConfig, RemovalConfig
 from retarget.model_folder import KERNEL, LINEAR, LSTM, MODEL, POSES, shapes_digest
