@@ -75,8 +75,10 @@ MOST_LOST = 0.2
 PART_LOST = 0.01
 """Share of the template away from the scan by which a hand may be lost: the way from afar is tried as well."""
 SETTLED = 0.006
-"""Mean distance of what has settled from the scan, metres, beyond which its lengths keep it from there: what follows is
-loose then, from a wide gate."""
+"""Mean distance of what has settled from the scan, metres, beyond which its own shape keeps it from there: cloth that
+has folded, or grown. Then its shape is left to the scan, in these two stages."""
+STIFF = Schedule(12, (0.03, 0.012), smooth=(300.0, 3.0), stretch=(10.0, 0.03), boundary=(0.3, 0.05))
+"""After the way from afar: what is smooth stays smooth, while limbs turn and slide into their places."""
 LOOSE = Schedule(8, (0.03, 0.012), smooth=(2.0, 0.2), stretch=(10.0, 0.03), boundary=(0.3, 0.05))
 FROM_AFAR = ("far", "again", "wide")
 """Ways by `approach`."""
@@ -238,9 +240,12 @@ def _keeping_lengths(tried: _Attempts, start: np.ndarray, landmarks: Landmarks |
 
     def placed(there: np.ndarray, *, turning: bool) -> np.ndarray:
         settled = _settled(tried, there, turning=turning)
-        lies = float(scan.surface.grid.query(settled)[0].mean()) <= SETTLED
-        dense = own if lies else replace(own, dense=replace(own.dense, cold=LOOSE))
-        return register_frame(analysis, scan, settled, config=_dense_alone(dense)).vertices
+        if float(scan.surface.grid.query(settled)[0].mean()) <= SETTLED:
+            return register_frame(analysis, scan, settled, config=_dense_alone(own)).vertices
+        for schedule in (STIFF, LOOSE) if turning else (LOOSE,):
+            dense = replace(own, dense=replace(own.dense, cold=schedule))
+            there = register_frame(analysis, scan, there, config=_dense_alone(dense)).vertices
+        return there
 
     def carried(begin: np.ndarray) -> np.ndarray:
         there = register_frame(analysis, scan, begin, config=_coarse_alone(own)).vertices
@@ -284,9 +289,9 @@ def _keeping_lengths(tried: _Attempts, start: np.ndarray, landmarks: Landmarks |
     if moved is not start and (near(moved) or far(moved)):
         return moved
     if tried.swung:
-        start = tried.best.fit.start
-        tried.add("wide", start, lambda: drawn(start, config.approach.wide, None))
-        return start
+        begin = tried.best.fit.start if moved is start else moved
+        tried.add("wide", begin, lambda: drawn(begin, config.approach.wide, None))
+        return begin
     return moved
 
 
