@@ -14,7 +14,6 @@ $(STAMP): pyproject.toml
 	@touch $@
 
 demo: $(STAMP)
-	$(BIN)/python -m pip install --quiet --editable '.[usd]' || echo 'without usd-core: the demo exports GLB'
 	$(BIN)/capture4d demo --output out
 
 # Threads that wait for each other over small matrices only slow the tests down.
