@@ -16,6 +16,7 @@ from rich.console import Console
 from benchmarks.learning_takes import Lesson, lesson, training_set, true_take
 from benchmarks.metric import Metric
 from capture4d.body.skinning import ShapedBody
+from capture4d.captures.animations.config import RemovalConfig
 from capture4d.captures.animations.frame_files import AnimatedFrame
 from capture4d.captures.capture import read_capture
 from capture4d.captures.evaluation import correspondence_errors
@@ -24,7 +25,7 @@ from capture4d.types import BlendshapeModel, PoseSequence, RegisteredSequence
 from data_synth.config import TrainingSetConfig
 from retarget.animation.animator import Animator
 from retarget.animation.bodies import retargeted_mean
-from retarget.config import AnimateConfig, RemovalConfig, ShapeConfig
+from retarget.config import AnimateConfig, ShapeConfig
 from retarget.regression.learning import learn_shapes, learned_rows
 from retarget.shapes.blendshapes import ShapeSpace, as_model_arrays, project
 

@@ -37,6 +37,7 @@ from benchmarks.learning_takes import learned_takes, registered_takes, training_
 from benchmarks.metric import Metric
 from benchmarks.renewal import renew
 from capture4d.body.skinning import with_shape
+from capture4d.captures.animations.config import RemovalConfig
 from capture4d.captures.work_folder import open_work
 from capture4d.errors import InputError
 from capture4d.files.records import save_body, save_poses
@@ -44,7 +45,7 @@ from capture4d.types import Mesh
 from retarget.animation.garment_model import load_garment_model
 from retarget.animation.stage import Wearer, run_on_coefficients
 from retarget.animation.stage import run as animate
-from retarget.config import AnimateConfig, FitConfig, RemovalConfig, ShapeConfig, SplitConfig
+from retarget.config import AnimateConfig, FitConfig, ShapeConfig, SplitConfig
 from retarget.fit_stage import run as fit
 from retarget.shapes.blendshapes import project, shape_space
 from retarget.shapes.pose_normalisation import PoseRows, unpose_sequence

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import field
 from typing import Annotated, Literal
 
+from capture4d.captures.animations.config import RemovalConfig
 from capture4d.settings import (
     Count,
     NonNegative,
@@ -202,22 +203,6 @@ class FitConfig:
     kernel: KernelConfig = field(default_factory=KernelConfig)
     lstm: LstmConfig = field(default_factory=LstmConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)
-
-
-@settings
-class RemovalConfig:
-    """Taking the garment out of the body, edges kept."""
-
-    enabled: bool = True
-    """Take the garment out of the body; off, edges alone keep to their lengths."""
-    margin_mm: NonNegative = 2.0
-    """How far outside the body its vertices are put."""
-    rounds: Whole = 12
-    """Searches for where the limbs are; it ends sooner if nothing moves."""
-    sweeps: Count = 15
-    """Passes over all edges and vertices from one search to the next."""
-    spread: Share = 0.2
-    """Share of the way to its neighbours' mean displacement that a vertex goes in a pass, at first; none in the end."""
 
 
 @settings

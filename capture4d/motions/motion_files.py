@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 from scipy.spatial.transform import Rotation, Slerp
 
 from capture4d.body.skinning import ShapedBody, with_shape
@@ -37,6 +37,7 @@ from capture4d.motions.smpl_parameters import RATES, are_smpl_parameters, read_s
 from capture4d.types import Body, PoseSequence
 
 __all__ = [
+    "motion_on",
     "rate_note",
     "read_motion",
     "resample",
@@ -91,6 +92,34 @@ def read_motion(
     if not same_rate(resampled.fps, poses.fps):
         say(rate_note(poses.fps, len(poses.frame_ids), resampled.fps, len(resampled.frame_ids)))
     return resampled
+
+
+def motion_on(path: Path, body: Body, shape: Float[np.ndarray, " shapes"], fps: float | None = None) -> PoseSequence:
+    """The motion of a file on a person, at its own rate or at the wanted one; what was resampled is told.
+
+    Args:
+        shape: of the person.
+        fps: frames a second; the file's own if absent.
+    Raises:
+        InputError: the file has no frames, or is of another skeleton.
+    """
+    say = told(path)
+    found = read_motion(path, body, say=say)
+    if found.joint_names != body.joint_names or not len(found.frame_ids):
+        raise InputError(
+            f"expected frames of the {len(body.joint_names)} joints of the model, found {len(found.frame_ids)} "
+            f"of {len(found.joint_names)}",
+            where=path,
+        )
+    found = replace(found, shape=np.asarray(shape, np.float32))
+    if fps is None or same_rate(fps, found.fps):
+        return found
+    try:
+        shown = resample(found, fps)
+    except InputError as error:
+        raise error.at(path) from None
+    say(rate_note(found.fps, len(found.frame_ids), shown.fps, len(shown.frame_ids)))
+    return shown
 
 
 def told(path: Path) -> Callable[[str], None]:

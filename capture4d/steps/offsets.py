@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from capture4d.app.cards.sources import with_card
+from capture4d.captures.animations.config import RemovalConfig
 from capture4d.captures.work_folder import AnyWork, Place, opened_work
 from capture4d.runs.run_log import logged_stage
 from capture4d.runs.stage import StageResult
-from wrinkles.offset_images.config import DrapeOffsetsConfig, OffsetConfig, PredictOffsetsConfig, RemovalConfig
+from wrinkles.offset_images.config import DrapeOffsetsConfig, OffsetConfig, PredictOffsetsConfig
 from wrinkles.offset_images.editing.config import DrawConfig
 
 if TYPE_CHECKING:

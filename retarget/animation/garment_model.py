@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from capture4d.body.skinning import ShapedBody
+from capture4d.captures.animations.config import RemovalConfig
 from capture4d.captures.animations.frame_files import FRAMES_AT_ONCE
 from capture4d.errors import InputError
 from capture4d.files.atomic import read_json
@@ -19,7 +20,7 @@ from capture4d.runs.stage import read_record
 from capture4d.types import BlendshapeModel, Body, PoseSequence
 from retarget.animation.animator import Animator
 from retarget.animation.bodies import captured_person, person_of_shape, require_motion, retargeted_mean
-from retarget.config import AnimateConfig, RemovalConfig
+from retarget.config import AnimateConfig
 from retarget.model_folder import KERNEL, LINEAR, LSTM, MODEL, POSES, shapes_digest
 from retarget.regression.controls import control_vectors
 from retarget.regression.ensemble import regressors_by_name

@@ -26,13 +26,12 @@ from capture4d.errors import InputError
 from capture4d.files.atomic import file_digest
 from capture4d.files.records import save_body, save_garment, save_poses
 from capture4d.geometry.mesh import edge_lengths, edge_stretch, stretch_p99, unique_edges
-from capture4d.motions.motion_files import rate_note, read_motion, resample, same_rate, told
+from capture4d.motions.motion_files import motion_on
 from capture4d.runs.stage import StageResult
 from capture4d.runs.workers import run_jobs
-from capture4d.types import PoseSequence
 from retarget.config import AnimateConfig
 from retarget.mixture.model_files import MODEL_FILES, load_styled_garment
-from retarget.mixture.styled_garment import StyledGarment, WornGarment
+from retarget.mixture.styled_garment import WornGarment
 
 __all__ = ["run"]
 
@@ -62,7 +61,7 @@ def run(
     known = load_styled_garment(model)
     style = style if isinstance(style, Mapping) else known.ranges.named(style)
     worn = known.worn(beta, style, config)
-    motion = _motion(known, poses, worn, config.fps)
+    motion = motion_on(poses, known.body, worn.person.shape, config.fps)
     files = [model / name for name in MODEL_FILES]
     settings = {**asdict(config), "beta": [*map(float, beta)], "style": dict(style)}
     upstream = {"model": file_digest(files, root=model), "poses": file_digest([poses], root=poses.parent)}
@@ -84,27 +83,6 @@ def run(
     ):
         pass
     return collect(stage, frame_ids)
-
-
-def _motion(known: StyledGarment, path: Path, worn: WornGarment, fps: float | None) -> PoseSequence:
-    """The motion on the person, at its own rate or at the wanted one."""
-    say = told(path)
-    found = read_motion(path, known.body, say=say)
-    if found.joint_names != known.body.joint_names or not len(found.frame_ids):
-        raise InputError(
-            f"expected frames of the {len(known.body.joint_names)} joints of the model, found {len(found.frame_ids)} "
-            f"of {len(found.joint_names)}",
-            where=path,
-        )
-    found = replace(found, shape=np.asarray(worn.person.shape, np.float32))
-    if fps is None or same_rate(fps, found.fps):
-        return found
-    try:
-        shown = resample(found, fps)
-    except InputError as error:
-        raise error.at(path) from None
-    say(rate_note(found.fps, len(found.frame_ids), shown.fps, len(shown.frame_ids), whose=""))
-    return shown
 
 
 def _worn(model: Path, beta: Sequence[float], style: Mapping[str, float], config: AnimateConfig) -> WornGarment:

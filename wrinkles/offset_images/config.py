@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import field, replace
 from typing import Annotated, Literal
 
+from capture4d.captures.animations.config import RemovalConfig
 from capture4d.settings import (
     Condition,
     Count,
@@ -16,7 +17,6 @@ from capture4d.settings import (
     Range,
     Seed,
     SettingError,
-    Share,
     Whole,
     settings,
 )
@@ -28,7 +28,6 @@ __all__ = [
     "OffsetTrainingConfig",
     "PatchConfig",
     "PredictOffsetsConfig",
-    "RemovalConfig",
     "StripConfig",
 ]
 
@@ -138,22 +137,6 @@ class DrapeOffsetsConfig:
     def __post_init__(self) -> None:
         if self.residual and self.partner:
             raise SettingError(self, "partner", "one of residual and partner", True)
-
-
-@settings
-class RemovalConfig:
-    """Taking the garment out of the body; `IntersectionRemoval` reads this."""
-
-    enabled: bool = True
-    """Take it out; off, what is inside is only measured."""
-    margin_mm: NonNegative = 2.0
-    """How far outside the body its vertices are put."""
-    rounds: Whole = 12
-    """Searches for where the limbs are; it ends sooner if nothing moves."""
-    sweeps: Count = 15
-    """Passes over all edges and vertices from one search to the next."""
-    spread: Share = 0.2
-    """Share of the way to its neighbours' mean displacement that a vertex goes in a pass, at first; none in the end."""
 
 
 @settings

@@ -33,10 +33,9 @@ from capture4d.files.records import save_body, save_garment, save_poses
 from capture4d.geometry.intersection_removal import IntersectionRemoval
 from capture4d.geometry.mesh import edge_stretch, flat_edge_lengths, stretch_p99, unique_edges
 from capture4d.geometry.uv_layout import require_uvs
-from capture4d.motions.motion_files import rate_note, read_motion, resample, same_rate, told
+from capture4d.motions.motion_files import motion_on
 from capture4d.runs.stage import StageResult, complete_record
 from capture4d.runs.workers import run_jobs
-from capture4d.types import PoseSequence
 from wrinkles.offset_images.config import PredictOffsetsConfig
 from wrinkles.offset_images.drape_model import DrapeOffsets, load_drape_offsets
 from wrinkles.offset_images.train_stage import STAGE as TRAINED
@@ -68,7 +67,7 @@ def run(
     record = complete_record(model, TRAINED, f"capture4d offsets train DRAPES --output {model}")
     known = load_drape_offsets(model)
     garment, body, shape = known.parts.garment, known.parts.body, known.parts.shape
-    motion = _motion(poses, known, config.fps)
+    motion = motion_on(poses, known.parts.body, known.parts.shape, config.fps)
     upstream = {"model": record["digest"], "poses": file_digest([poses], root=poses.parent)}
     stage = open_frames(output, asdict(config), upstream, {"model": model, "poses": poses}, overwrite=overwrite)
     body_path, poses_path = motion_files(output)
@@ -87,24 +86,6 @@ def run(
     ):
         pass
     return collect(stage, frame_ids)
-
-
-def _motion(path: Path, known: DrapeOffsets, fps: float | None) -> PoseSequence:
-    """The motion on the person, at its own rate or at the wanted one."""
-    say = told(path)
-    found = read_motion(path, known.parts.body, say=say)
-    if found.joint_names != known.parts.body.joint_names or not len(found.frame_ids):
-        raise InputError(f"expected frames of the {len(known.parts.body.joint_names)} joints of the model, found "
-                         f"{len(found.frame_ids)} of {len(found.joint_names)}", where=path)  # fmt: skip
-    found = replace(found, shape=np.asarray(known.parts.shape, np.float32))
-    if fps is None or same_rate(fps, found.fps):
-        return found
-    try:
-        shown = resample(found, fps)
-    except InputError as error:
-        raise error.at(path) from None
-    say(rate_note(found.fps, len(found.frame_ids), shown.fps, len(shown.frame_ids), whose=""))
-    return shown
 
 
 @dataclass(frozen=True, slots=True, eq=False)

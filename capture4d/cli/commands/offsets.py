@@ -8,11 +8,11 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from capture4d.captures.animations.config import RemovalConfig
 from capture4d.cli.commands.files import FileOptions
 from capture4d.cli.exit_codes import GOOD
 from capture4d.cli.options import MeshOptions
 from capture4d.settings import Whole
-from wrinkles.offset_images.config import RemovalConfig
 from wrinkles.offset_images.editing.config import DrawConfig
 
 __all__ = ["OffsetsApply", "OffsetsDraw", "OffsetsEdit"]

@@ -20,6 +20,7 @@ from jaxtyping import Float32, Float64
 from capture4d.body.binding import with_body_shape
 from capture4d.body.limbs import WornBody
 from capture4d.body.skinning import PosedBody, pose_frame, with_shape
+from capture4d.captures.animations.config import RemovalConfig
 from capture4d.captures.work_folder import WorkFolder
 from capture4d.errors import InputError
 from capture4d.files.arrays import ArrayFile
@@ -29,7 +30,6 @@ from capture4d.files.reading import reading
 from capture4d.geometry.intersection_removal import IntersectionRemoval, Removed
 from capture4d.geometry.mesh import edge_lengths, unique_edges
 from capture4d.types import Mesh
-from wrinkles.offset_images.config import RemovalConfig
 from wrinkles.offset_images.editing.changes import changed_vertices
 from wrinkles.offset_images.editing.config import DrawConfig, PictureFormat
 from wrinkles.offset_images.editing.operations import apply_operation, read_operations

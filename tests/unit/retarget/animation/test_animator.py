@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from capture4d.body.skinning import with_pose, with_shape
+from capture4d.captures.animations.config import RemovalConfig
 from capture4d.captures.animations.frame_files import AnimatedFrame
 from capture4d.captures.animations.known_poses import nearest_poses, pose_quaternions
 from capture4d.errors import InputError
@@ -14,7 +15,7 @@ from capture4d.geometry.mesh import unique_edges
 from capture4d.types import BlendshapeModel, Body, Garment, PoseSequence
 from retarget.animation.animator import Animator
 from retarget.animation.bodies import captured_person, retargeted_mean
-from retarget.config import AnimateConfig, RemovalConfig
+from retarget.config import AnimateConfig
 from retarget.shapes.pose_normalisation import unpose_frame
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from capture4d.body.skinning import pose_frame
+from capture4d.captures.animations.config import RemovalConfig
 from capture4d.captures.work_folder import load_registration, open_work
 from capture4d.errors import InputError
 from capture4d.files.records import save_poses
@@ -14,7 +15,7 @@ from capture4d.geometry.ray_casting import TriangleScene
 from capture4d.types import PoseSequence
 from retarget.animation.garment_model import GarmentModel, load_garment_model
 from retarget.animation.stage import Wearer, run
-from retarget.config import AnimateConfig, RemovalConfig
+from retarget.config import AnimateConfig
 
 
 @pytest.fixture(scope="module")

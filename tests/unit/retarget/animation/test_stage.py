@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from capture4d.body.skinning import pose_frame, skin, with_shape
+from capture4d.captures.animations.config import RemovalConfig
 from capture4d.captures.work_folder import load_records, load_registration, open_work
 from capture4d.cli.main import main
 from capture4d.errors import InputError
@@ -19,7 +20,7 @@ from capture4d.types import BlendshapeModel
 from retarget.animation import garment_model
 from retarget.animation.garment_model import load_garment_model
 from retarget.animation.stage import run_on_coefficients
-from retarget.config import AnimateConfig, RemovalConfig
+from retarget.config import AnimateConfig
 from retarget.shapes.files import load_blendshapes
 
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from capture4d.body.binding import bind
+from capture4d.captures.animations.config import RemovalConfig
 from capture4d.captures.drapes.drape_parts import mirrored_drapes, read_drape_parts
 from capture4d.captures.drapes.drape_sets import read_drapes
 from capture4d.captures.work_folder import open_work
@@ -28,7 +29,6 @@ from wrinkles.offset_images.config import (
     OffsetTrainingConfig,
     PatchConfig,
     PredictOffsetsConfig,
-    RemovalConfig,
     StripConfig,
 )
 from wrinkles.offset_images.drape_lessons import drape_lesson

@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 import pytest
 
+from capture4d.captures.animations.config import RemovalConfig
 from capture4d.captures.work_folder import WorkFolder, open_work
 from capture4d.cli.main import main
 from capture4d.errors import InputError
 from capture4d.mesh_files.meshes import read_mesh
 from tests.unit.wrinkles.offset_images.test_stage import bound_work
-from wrinkles.offset_images.config import RemovalConfig
 from wrinkles.offset_images.editing.config import DrawConfig
 from wrinkles.offset_images.editing.operations import Operation, apply_operation, brush, parse_operations, smoothed
 from wrinkles.offset_images.editing.stage import apply, draw, edit
