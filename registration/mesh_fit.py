@@ -334,16 +334,17 @@ def _resized(tried: _Attempts, start: np.ndarray) -> None:
 
 
 def _freeing_lengths(tried: _Attempts, start: np.ndarray) -> None:
-    """Soft, from the start; where limbs had to swing, from where the lengths let them come first."""
+    """Soft, from the start; where limbs had to swing, from where the lengths let them come as well."""
     soft = tried.config.soft
     analysis = analyse_template(tried.garment, soft)
     scan = prepare_frame(analysis, tried.garment_scan, soft)
 
-    def softly(there: np.ndarray, settings: RegistrationConfig) -> bool:
-        return tried.add("soft", start, lambda: register_frame(analysis, scan, there, config=settings).vertices, scan)
+    def softly(there: np.ndarray, settings: RegistrationConfig) -> None:
+        tried.add("soft", start, lambda: register_frame(analysis, scan, there, config=settings).vertices, scan)
 
-    if not (tried.swung and softly(tried.best.fit.vertices, _dense_alone(soft))):
-        softly(start, soft)
+    if tried.swung:
+        softly(tried.best.fit.vertices, _dense_alone(soft))
+    softly(start, soft)
 
 
 def _moved_there(start: np.ndarray, scan: FrameScan) -> np.ndarray:

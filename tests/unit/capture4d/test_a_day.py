@@ -19,6 +19,7 @@ import registration.take
 from benchmarks.dressed_body import dress_body
 from capture4d import pipeline
 from capture4d.app.report import take as report_stage
+from capture4d.app.status.work_folders import changes
 from capture4d.body.anny import load_anny
 from capture4d.body.skinning import pose_frame, with_shape
 from capture4d.captures.capture import read_capture
@@ -158,7 +159,7 @@ def test_a_day(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: 
         studio.scan(frame_id)
     grow(raw, take)
     capsys.readouterr()
-    extracting, tracking, _ = pipeline.changes(take, work, tracking=tracking_config(tmp_path))
+    extracting, tracking, _ = changes(take, work, tracking=tracking_config(tmp_path))
     assert extracting.inputs == ("5 frames added (5-9)",)
     assert (extracting.pending, tracking.pending) == ((5, 6, 7, 8, 9), (5, 6, 7, 8, 9))
     assert tracking.kept == ("shape, found from frames 1-4",)
