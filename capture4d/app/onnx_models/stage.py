@@ -37,6 +37,7 @@ from retarget.config import AnimateConfig
 from retarget.mixture.config import MODEL as STYLES
 from retarget.mixture.model_files import MODEL_FILES, load_styled_garment
 from retarget.model_folder import MODEL, regressor_files
+from retarget.regression.ensemble import EnsembleRegressor
 from retarget.regression.known_range import BoundedRegressor
 from retarget.regression.regressors import Regressor
 from retarget.shapes.blendshapes import reconstruct
@@ -234,8 +235,9 @@ def _numbers(said: Sequence[str]) -> dict[str, float]:
 def _probe_controls(regressor: Regressor, count: int, rng: np.random.Generator) -> np.ndarray:
     """(n, controls) float32: between learned poses, a few far beyond them, in motion up to twice what was learned."""
     bounded = regressor
-    while not isinstance(bounded, BoundedRegressor):
-        bounded = getattr(bounded, "first")  # noqa: B009 of an ensemble, whose first sees what both see
+    while isinstance(bounded, EnsembleRegressor):
+        bounded = bounded.first  # sees what both see
+    assert isinstance(bounded, BoundedRegressor)
     known, layout = bounded.controls, bounded.layout
     found = np.repeat(known.mean[None].astype(np.float64), count, axis=0)
     one, other = (known.poses[rng.integers(0, len(known.poses), count)] for _ in range(2))

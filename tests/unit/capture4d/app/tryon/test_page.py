@@ -1,6 +1,5 @@
 """The page of the try-on, without a browser: what its sliders say is what is worn."""
 
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from capture4d.app.tryon.session import Session
 from capture4d.app.viewer.scenery import open_server
 from capture4d.files.records import save_poses
 from tests.unit.retarget.conftest import some_motion
+from tests.waiting import until
 
 Open = Callable[..., TryOnPage]
 
@@ -35,15 +35,6 @@ def opened(tmp_path: Path) -> Iterator[Open]:
     for page, server in closing:
         page.close()
         server.stop()
-
-
-def until(holds: Callable[[], bool]) -> bool:
-    ends = time.monotonic() + 60
-    while not holds():
-        if time.monotonic() > ends:
-            return False
-        time.sleep(0.02)
-    return True
 
 
 def test_sliders_pose_and_shape_and_style(opened: Open, styled: TriedGarment):

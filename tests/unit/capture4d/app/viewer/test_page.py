@@ -16,6 +16,7 @@ from capture4d.app.viewer.surfaces import Surface, surface_glb
 from capture4d.app.viewer.take import BODY_LAYER, CLOTH_LAYER, PLAIN, SCAN, open_take
 from capture4d.errors import InputError
 from tests.moving_garment import write_moving_work
+from tests.waiting import until
 
 Open = Callable[..., ViewerPage]
 
@@ -38,15 +39,6 @@ def opened() -> Iterator[Open]:
     for page, server in closing:
         page.close()
         server.stop()
-
-
-def until(holds: Callable[[], bool]) -> bool:
-    ends = time.monotonic() + 30
-    while not holds():
-        if time.monotonic() > ends:
-            return False
-        time.sleep(0.02)
-    return True
 
 
 def sent(page: ViewerPage, layer: str, take: int = 0) -> Any:
