@@ -34,7 +34,7 @@ def hang(path):
 
 def greedy(path):
     if path.read_bytes() != WHOLE:
-        bytearray(200_000_000)
+        bytearray(120_000_000)
 
 def careless(path):
     if path.read_bytes() != WHOLE:
@@ -45,7 +45,7 @@ kinds.KINDS[:] = [kinds.Kind(f"{name}.json", lambda path: path.write_bytes(WHOLE
                   for name, read in READERS.items()]
 kinds.BY_NAME.clear()
 kinds.BY_NAME.update({kind.name: kind for kind in kinds.KINDS})
-worker.CPU_S = 0.3
+worker.CPU_S = 3.0
 
 if __name__ == "__main__":
     for outcome in worker.read_apart(worker.Reading(0, 5)):
