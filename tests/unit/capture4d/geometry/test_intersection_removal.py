@@ -39,7 +39,7 @@ class Cylinder:
             distance - self.radius, normals, feet, normals, np.where(inside_wall, np.inf, room), inside_wall
         )
 
-    def heights(self, points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+    def heights(self, points: np.ndarray, vertices: np.ndarray, numbers: np.ndarray) -> np.ndarray:
         return self.contacts(points).heights
 
 
