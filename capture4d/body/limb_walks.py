@@ -24,7 +24,7 @@ from jaxtyping import Float32, Float64, Int32
 from capture4d.geometry.triangles import along3, closest_in_triangle, cross3, dot3, row3
 from capture4d.heavy_imports import njit
 
-__all__ = ["Walks", "heights_over", "spread_corners", "walk", "walk_again"]
+__all__ = ["Walks", "face_rows", "walk", "walk_again"]
 
 CAPACITY = 32
 """Faces of a walk that are remembered, with a place for each round; of a longer walk nothing is."""
@@ -84,21 +84,24 @@ class Walks:
 
 
 @njit(cache=True)
-def spread_corners(vertices, faces):
-    """Positions of each face's corners in a row, (F, 9), and which faces are too thin for exact nearest points."""
-    corners, needles = np.empty((len(faces), 9)), np.zeros(len(faces), np.bool_)
+def face_rows(vertices, normals, faces):
+    """All that is asked of a face in a row, (F, 18): positions and normals of its corners; and which faces are too thin
+    for their nearest points to be exact."""
+    rows, needles = np.empty((len(faces), 18)), np.zeros(len(faces), np.bool_)
     for f in range(len(faces)):
+        for corner in range(3):
+            v = faces[f, corner]
+            for k in range(3):
+                rows[f, 3 * corner + k], rows[f, 9 + 3 * corner + k] = vertices[v, k], normals[v, k]
         a, b, c = row3(vertices, faces[f, 0]), row3(vertices, faces[f, 1]), row3(vertices, faces[f, 2])
-        for k in range(3):
-            corners[f, k], corners[f, 3 + k], corners[f, 6 + k] = a[k], b[k], c[k]
         u, v, w = along3(b, 1.0, a, -1.0), along3(c, 1.0, a, -1.0), along3(c, 1.0, b, -1.0)
         normal, longest = cross3(u, v), max(dot3(u, u), dot3(v, v), dot3(w, w))
         needles[f] = not dot3(normal, normal) > NEEDLE_M**2 * longest
-    return corners, needles
+    return rows, needles
 
 
 @njit(cache=True)
-def walk(points, starts, corners, faces, offsets, fans):
+def walk(points, starts, rows, faces, offsets, fans):
     """For each point a face from which no face around is nearer, and barycentrics of the nearest point in it.
 
     Nothing is left out: this is what `walk_again` is measured by.
@@ -113,7 +116,7 @@ def walk(points, starts, corners, faces, offsets, fans):
                 vertex = faces[around, corner]
                 for entry in range(offsets[vertex], offsets[vertex + 1]):
                     f = fans[entry]
-                    distance, u, v, w = _to_face(p, corners, f)
+                    distance, u, v, w = _to_face(p, rows, f)
                     if distance < best - NEARER_M2:
                         best, face, nearer = distance, f, True
                         weights[i, 0], weights[i, 1], weights[i, 2] = u, v, w
@@ -123,16 +126,19 @@ def walk(points, starts, corners, faces, offsets, fans):
 
 @njit(cache=True)
 def walk_again(
-    points, numbers, starts, corners, needles, faces, offsets, fans,
+    points, numbers, starts, rows, needles, faces, offsets, fans,
     known_starts, origins, known_ends, reaches, clear, lengths, passed, gaps, seen, walked,
 ):  # fmt: skip
-    """The same as `walk`, of points that are known by their numbers, from what was remembered of them.
+    """What `walk` finds, of points that are known by their numbers, from what was remembered of them.
 
     Args:
         numbers: rows of the `Walks`, whose arrays the last ones are.
-        corners, needles: `spread_corners`.
+        rows, needles: `face_rows`.
+    Returns:
+        Heights over the nearest points, unit normals there, these points, and their faces.
     """
-    found, weights = starts.copy(), np.zeros((len(points), 3))
+    found, heights = starts.copy(), np.empty(len(points))
+    directions, feet = np.empty((len(points), 3)), np.empty((len(points), 3))
     tested, squares = np.empty(PASSED, np.int32), np.empty(PASSED)
     ends, winners, bests = np.empty(PASSED, np.int32), np.empty(PASSED, np.int32), np.empty(PASSED)
     for i in range(len(points)):
@@ -144,16 +150,16 @@ def walk_again(
             u, v, w = 0.0, 0.0, 0.0
             if slack < clear[row]:
                 face = known_ends[row]
-                _, u, v, w = _to_face(p, corners, face)
+                _, u, v, w = _to_face(p, rows, face)
             elif slack <= reaches[row]:
-                face, u, v, w = _repeated(p, slack, row, lengths, passed, gaps, corners, squares, bests)
+                face, u, v, w = _repeated(p, slack, row, lengths, passed, gaps, rows, squares, bests)
                 if face >= 0 and (slack > RENEWED_M or lengths[row] > LONG):
                     reaches[row] = min(reaches[row] - slack, SHRINKING * max(slack, RENEWED_M))
                     clear[row] = _renewed(slack, reaches[row], row, lengths, passed, gaps, squares, bests)
                     origins[row, 0], origins[row, 1], origins[row, 2] = p
             if face >= 0:
                 found[i] = face
-                weights[i, 0], weights[i, 1], weights[i, 2] = u, v, w
+                _stand(p, rows, face, u, v, w, i, heights, directions, feet)
                 continue
         walked[0] += 1
         stamp, face, best, u, v, w = walked[0], starts[i], np.inf, 0.0, 0.0, 0.0
@@ -167,7 +173,7 @@ def walk_again(
                     if seen[f] == stamp:
                         continue  # it was not nearer than what was nearest then, nor is it now
                     seen[f] = stamp
-                    distance, first, second, third = _to_face(p, corners, f)
+                    distance, first, second, third = _to_face(p, rows, f)
                     if count < PASSED:
                         tested[count], squares[count] = f, distance
                     count += 1
@@ -178,7 +184,7 @@ def walk_again(
                 ends[rounds], winners[rounds], bests[rounds] = count, face, best
             rounds += 1
         found[i] = face
-        weights[i, 0], weights[i, 1], weights[i, 2] = u, v, w
+        _stand(p, rows, face, u, v, w, i, heights, directions, feet)
         known_starts[row] = -1
         if max(count, rounds) <= PASSED:
             lengths[row], clear[row] = _remembered(
@@ -187,15 +193,15 @@ def walk_again(
             if lengths[row] > 0:
                 known_starts[row], known_ends[row], reaches[row] = starts[i], face, REMEMBERED_M
                 origins[row, 0], origins[row, 1], origins[row, 2] = p
-    return found, weights
+    return heights, directions, feet, found
 
 
 @njit(cache=True)
-def _to_face(p, corners, f):
+def _to_face(p, rows, f):
     """Square of a point's distance to a face, and barycentrics of the nearest point."""
-    a = corners[f, 0], corners[f, 1], corners[f, 2]
-    b = corners[f, 3], corners[f, 4], corners[f, 5]
-    c = corners[f, 6], corners[f, 7], corners[f, 8]
+    a = rows[f, 0], rows[f, 1], rows[f, 2]
+    b = rows[f, 3], rows[f, 4], rows[f, 5]
+    c = rows[f, 6], rows[f, 7], rows[f, 8]
     u, v, w = closest_in_triangle(p, a, b, c)
     x = p[0] - u * a[0] - v * b[0] - w * c[0]
     y = p[1] - u * a[1] - v * b[1] - w * c[1]
@@ -246,7 +252,7 @@ def _without_certain(length, reach, row, passed, gaps):
 
 
 @njit(cache=True)
-def _repeated(p, slack, row, lengths, passed, gaps, corners, squares, bests):
+def _repeated(p, slack, row, lengths, passed, gaps, rows, squares, bests):
     """Where the same walk ends, and barycentrics there; -1 for the face if a round ends at another one than before.
 
     Args:
@@ -267,7 +273,7 @@ def _repeated(p, slack, row, lengths, passed, gaps, corners, squares, bests):
                 best, at = np.inf, -1  # nearer ones follow for sure
             wanted, rounds = -1 - f, rounds + 1
         elif gaps[row, j] <= slack:
-            squares[j], first, second, third = _to_face(p, corners, f)
+            squares[j], first, second, third = _to_face(p, rows, f)
             if squares[j] < best - NEARER_M2:
                 best, at = squares[j], f
                 u, v, w = first, second, third
@@ -309,24 +315,17 @@ def _renewed(slack, reach, row, lengths, passed, gaps, squares, bests):
 
 
 @njit(cache=True)
-def heights_over(points, found, weights, vertices, normals, faces):
-    """Heights, normals and nearest points, of the faces and barycentrics that a walk has found.
+def _stand(p, rows, f, u, v, w, i, heights, directions, feet):
+    """Fill row i with the height over a point of a face, the normal there, and the point.
 
-    Sums are in numpy's order (of a norm as written, of `einsum` the middle one last), so that what was computed with it
-    before is the same to the bit.
+    Sums are in numpy's order (of `einsum` the middle one last), in which this was computed before: the same to the bit.
     """
-    heights, directions, feet = np.empty(len(points)), np.empty((len(points), 3)), np.empty((len(points), 3))
-    for i in range(len(points)):
-        a, b, c = faces[found[i], 0], faces[found[i], 1], faces[found[i], 2]
-        u, v, w = weights[i, 0], weights[i, 1], weights[i, 2]
-        for k in range(3):
-            feet[i, k] = u * vertices[a, k] + v * vertices[b, k] + w * vertices[c, k]
-            directions[i, k] = u * normals[a, k] + v * normals[b, k] + w * normals[c, k]
-        x, y, z = directions[i, 0], directions[i, 1], directions[i, 2]
-        length = max(np.sqrt(x * x + y * y + z * z), 1e-12)
-        x, y, z = x / length, y / length, z / length
-        directions[i, 0], directions[i, 1], directions[i, 2] = x, y, z
-        p, q, r = points[i, 0] - feet[i, 0], points[i, 1] - feet[i, 1], points[i, 2] - feet[i, 2]
-        apart = np.sqrt(p * p + q * q + r * r)
-        heights[i] = -apart if p * x + r * z + q * y < 0 else apart
-    return heights, directions, feet
+    for k in range(3):
+        feet[i, k] = u * rows[f, k] + v * rows[f, 3 + k] + w * rows[f, 6 + k]
+        directions[i, k] = u * rows[f, 9 + k] + v * rows[f, 12 + k] + w * rows[f, 15 + k]
+    normal, apart = row3(directions, i), along3(p, 1.0, row3(feet, i), -1.0)
+    length = max(np.sqrt(dot3(normal, normal)), 1e-12)
+    x, y, z = normal[0] / length, normal[1] / length, normal[2] / length
+    directions[i, 0], directions[i, 1], directions[i, 2] = x, y, z
+    distance = np.sqrt(dot3(apart, apart))
+    heights[i] = -distance if apart[0] * x + apart[2] * z + apart[1] * y < 0 else distance

@@ -18,7 +18,7 @@ from jaxtyping import Float, Float32, Float64, Int32, Int64
 from scipy.spatial import KDTree
 
 from capture4d.body.limb_rays import LEAVING_M, LimbPieces, PosedPieces
-from capture4d.body.limb_walks import Walks, heights_over, spread_corners, walk_again
+from capture4d.body.limb_walks import Walks, face_rows, walk_again
 from capture4d.body.skinning import ShapedBody
 from capture4d.geometry.intersection_removal import Contacts
 from capture4d.geometry.mesh_kernels import vertex_normals_kernel
@@ -136,8 +136,7 @@ class LimbSurfaces:
     def __init__(self, worn: _Worn, vertices: Float[np.ndarray, "skin 3"], start: Int32[np.ndarray, " verts"]) -> None:
         self._worn, self._start, self._at = worn, start, start
         self._vertices = np.ascontiguousarray(vertices, np.float64)
-        self._normals = vertex_normals_kernel(self._vertices, worn.faces)
-        self._corners = spread_corners(self._vertices, worn.faces)
+        self._rows = face_rows(self._vertices, vertex_normals_kernel(self._vertices, worn.faces), worn.faces)
         self._walks, self._probes = Walks(len(start), len(worn.faces)), Walks(0, len(worn.faces))
         self._others = [(limb.strangers, PosedPieces(limb.pieces, self._vertices)) for limb in worn.limbs]
 
@@ -179,10 +178,7 @@ class LimbSurfaces:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Heights, normals, nearest points and their faces, walking from some faces."""
         worn = self._worn
-        found, weights = walk_again(
-            points, numbers, start, *self._corners, worn.faces, worn.offsets, worn.fans, *walks.arrays
-        )
-        return *heights_over(points, found, weights, self._vertices, self._normals, worn.faces), found
+        return walk_again(points, numbers, start, *self._rows, worn.faces, worn.offsets, worn.fans, *walks.arrays)
 
 
 @njit(cache=True)

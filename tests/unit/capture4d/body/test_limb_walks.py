@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from capture4d.body.limb_walks import Walks, heights_over, spread_corners, walk, walk_again
+from capture4d.body.limb_walks import Walks, face_rows, walk, walk_again
 from capture4d.geometry.mesh import vertex_normals
 from tests.shapes import tube
 
@@ -31,6 +31,12 @@ def surface(kind: str, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray
     return vertices, faces
 
 
+def blended(values: np.ndarray, corners: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Of three corners, added up in their order."""
+    first, second, third = (weights[:, [k]] * values[corners[:, k]] for k in range(3))
+    return first + second + third
+
+
 @pytest.mark.parametrize("kind", ["tube", "creased", "needles"])
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("step_m", [0.0, 1e-7, 2e-4, 1e-3, 3e-3, 2e-2])
@@ -43,13 +49,22 @@ def test_a_walk_that_is_repeated_is_the_walk(kind: str, seed: int, step_m: float
     starts = fans[offsets[under]]
     points = vertices[under] * rng.uniform(0.8, 1.3, (400, 1))
     points[200:] += 0.02 * rng.standard_normal((200, 3))
-    known, (corners, needles) = Walks(900, len(faces)), spread_corners(vertices, faces)
+    normals = vertex_normals(vertices, faces)
+    known, (rows, needles) = Walks(900, len(faces)), face_rows(vertices, normals, faces)
     numbers = rng.permutation(900)[:400]
     for _ in range(8):
-        wanted = walk(points, starts, corners, faces, offsets, fans)
-        found = walk_again(points, numbers, starts, corners, needles, faces, offsets, fans, *known.arrays)
-        np.testing.assert_array_equal(found[0], wanted[0])
-        np.testing.assert_array_equal(found[1], wanted[1])
+        wanted, weights = walk(points, starts, rows, faces, offsets, fans)
+        heights, directions, feet, found = walk_again(
+            points, numbers, starts, rows, needles, faces, offsets, fans, *known.arrays
+        )
+        np.testing.assert_array_equal(found, wanted)
+        np.testing.assert_array_equal(feet, blended(vertices, faces[wanted], weights))
+        outwards = blended(normals, faces[wanted], weights)
+        outwards /= np.maximum(np.linalg.norm(outwards, axis=1, keepdims=True), 1e-12)
+        np.testing.assert_allclose(directions, outwards, rtol=0, atol=1e-15)
+        inside = np.einsum("px,px->p", points - feet, outwards) < 0
+        distance = np.linalg.norm(points - feet, axis=1)
+        np.testing.assert_allclose(heights, np.where(inside, -distance, distance), rtol=0, atol=1e-15)
         points = points + step_m * rng.standard_normal(points.shape) * (rng.random((400, 1)) < 0.8)
         moved = rng.choice(400, 20, replace=False)
         starts[moved] = fans[offsets[rng.integers(0, len(vertices), 20)]]
@@ -60,21 +75,5 @@ def test_a_walk_that_is_repeated_is_the_walk(kind: str, seed: int, step_m: float
 def test_faces_without_height_are_told() -> None:
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0.5, 1e-6, 0], [0.5, 0.1, 0], [0.5, 0.0, 0.0]], np.float64)
     faces = np.array([[0, 1, 2], [0, 1, 3], [0, 1, 4], [3, 3, 0]], np.int32)
-    np.testing.assert_array_equal(spread_corners(vertices, faces)[1], [True, False, True, True])
-
-
-def test_heights_are_those_of_arrays() -> None:
-    """What is written with numpy, to the bit."""
-    rng = np.random.default_rng(3)
-    vertices, faces = surface("creased", rng)
-    normals = vertex_normals(vertices, faces)
-    found, weights = rng.integers(0, len(faces), 500), rng.dirichlet(np.ones(3), 500)
-    points = vertices[faces[found, 0]] + 0.02 * rng.standard_normal((500, 3))
-    feet = np.einsum("pk,pkx->px", weights, vertices[faces[found]])
-    directions = np.einsum("pk,pkx->px", weights, normals[faces[found]])
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    apart = points - feet
-    heights = np.linalg.norm(apart, axis=1) * np.where(np.einsum("px,px->p", apart, directions) < 0, -1.0, 1.0)
-    again = heights_over(points, found, weights, vertices, normals, faces)
-    for each, wanted in zip(again, (heights, directions, feet), strict=True):
-        np.testing.assert_allclose(each, wanted, rtol=0, atol=1e-15)
+    needles = face_rows(vertices, np.zeros_like(vertices), faces)[1]
+    np.testing.assert_array_equal(needles, [True, False, True, True])
