@@ -17,11 +17,14 @@ from capture4d.captures.drapes.style_sets import Ranges
 from capture4d.geometry.intersection_removal import Penetration
 from capture4d.learning.convex_fits import furthest_first
 from capture4d.types import Mesh
+from data_synth.drapes.config import DrapesConfig
+from data_synth.drapes.draping import Draper
+from data_synth.styles.config import StyleSetConfig
 from retarget.mixture.lesson import PairDrapes, StyleLesson
 from retarget.mixture.style_fit import SeenFrame, fit_style
 from retarget.mixture.styled_garment import StyledGarment
 
-__all__ = ["fit_metrics", "frame_metrics", "prototype_metrics"]
+__all__ = ["fit_metrics", "frame_metrics", "prototype_metrics", "solver_metrics"]
 
 STYLE_SIGMAS = 1.5
 NOISE_M, MISSING = 0.001, 0.25
@@ -59,6 +62,21 @@ def frame_metrics(garment: StyledGarment, lesson: StyleLesson, *, frames: int = 
         Metric("frame_exact_ms", 1e3 * float(np.median(exact)), "ms"),
         Metric("frame_inside_percent", float(np.mean(left)), "%"),
     ]
+
+
+def solver_metrics(config: StyleSetConfig, lesson: StyleLesson, *, drapes: int = 3) -> list[Metric]:
+    """Milliseconds of a drape as the solver makes it, on one core, of the same mesh in the same poses: what `frame_ms`
+    takes the place of. The pattern's own style, on the mean person, who is dressed before."""
+    cut = DrapesConfig(
+        garment=config.garment, vertices=config.vertices, seed=config.seed, poses=config.pose, solver=config.solver
+    )
+    pair = _test_pairs(lesson)[0]
+    draper, took = Draper(cut, pair.person.body), []
+    for row in np.flatnonzero(pair.unseen)[:drapes]:
+        begun = time.process_time()
+        draper.drape(pair.rotations[row].astype(np.float64))
+        took.append(time.process_time() - begun)
+    return [Metric("drape_ms", 1e3 * float(np.median(took)), "ms")]
 
 
 def fit_metrics(garment: StyledGarment, lesson: StyleLesson, *, frames: int = 3) -> list[Metric]:

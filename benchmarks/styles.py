@@ -22,7 +22,7 @@ from pathlib import Path
 from rich.console import Console
 
 from benchmarks.metric import Metric
-from benchmarks.style_use import fit_metrics, frame_metrics, prototype_metrics
+from benchmarks.style_use import fit_metrics, frame_metrics, prototype_metrics, solver_metrics
 from capture4d.cache import user_cache_folder
 from capture4d.captures.drapes.style_sets import read_style_set
 from data_synth.drapes.stage import SCHEMA as DRAPES_SCHEMA
@@ -71,6 +71,7 @@ def run(
         for metric in (
             *prototype_metrics(lesson),
             *frame_metrics(garment, lesson),
+            *(solver_metrics(replace(base, seed=seed), lesson) if styles is None else ()),
             *fit_metrics(garment, lesson, frames=1 if quick else 3),
         ):
             use.setdefault(metric.key, []).append(metric)

@@ -26,7 +26,7 @@ from scipy.spatial import KDTree
 from capture4d.body.limbs import carrying_skin
 from capture4d.body.skinning import PosedBody, ShapedBody, sparse_weights
 from capture4d.body.surface_kernels import skin_sparse
-from capture4d.geometry.intersection_removal import SHORTEST, project
+from capture4d.geometry.intersection_removal import SHORTEST, project, sweep_order
 from capture4d.geometry.mesh import edge_lengths, unique_edges, vertex_adjacency
 from capture4d.geometry.mesh_kernels import vertex_normals_kernel
 from capture4d.geometry.triangles import closest_in_triangle, row3
@@ -81,7 +81,8 @@ class BodyCandidates:
         self._edges = unique_edges(faces)
         lengths = np.maximum(edge_lengths(points, self._edges), 1e-9)
         self._longest, self._shortest = longest * lengths, SHORTEST * lengths
-        self._cloth_around = _rows(vertex_adjacency(faces, len(points)))
+        rows = _rows(vertex_adjacency(faces, len(points)))
+        self._cloth_around = *rows, sweep_order(*rows)
         self._margin = margin_m
 
     @property
@@ -114,7 +115,7 @@ class BodyCandidates:
         result, at = start.copy(), self._start.copy()
         shortest = np.minimum(self._shortest, edge_lengths(start, self._edges))
         feet, outwards, low = np.zeros_like(start), np.zeros_like(start), np.full(len(start), -np.inf)
-        high = np.full(len(start), np.inf)
+        high, due, travelled = np.full(len(start), np.inf), np.full(len(shortest), -1.0), np.zeros(len(start))
         for search in range(searches):
             inside = _look_up(
                 result, at, skin, normals, self._faces, *self._around, *self._fans, self._margin, feet, outwards, low
@@ -123,8 +124,8 @@ class BodyCandidates:
                 break
             spread = LESS * (1 - (search + 1) / searches)
             project(
-                result, start, self._edges, self._longest, shortest, *self._cloth_around, feet, outwards, outwards,
-                low, high, spread, sweeps,
+                result, start, self._edges, self._longest, shortest, due, travelled, *self._cloth_around,
+                feet, outwards, outwards, low, high, spread, sweeps,
             )  # fmt: skip
         return result
 

@@ -62,12 +62,15 @@ class PosedBody:
 
     def vertices(self) -> Float64[np.ndarray, "verts 3"]:
         """Skinned body surface, metres, world frame."""
-        body = self.shaped.body
-        rest = self.shaped.vertices
-        if body.pose_directions is not None:
-            feature = (np.asarray(self.rotations[1:], np.float64) - np.eye(3)).ravel()
-            rest = rest + np.tensordot(feature, body.pose_directions, axes=1)
-        return skin(rest, body.skin_weights, self.transforms)
+        return skin(self.corrected(), self.shaped.body.skin_weights, self.transforms)
+
+    def corrected(self) -> Float64[np.ndarray, "verts 3"]:
+        """The surface in the rest pose with what the pose changes in its form, metres."""
+        body, rest = self.shaped.body, self.shaped.vertices
+        if body.pose_directions is None:
+            return rest
+        feature = (np.asarray(self.rotations[1:], np.float64) - np.eye(3)).ravel()
+        return rest + np.tensordot(feature, body.pose_directions, axes=1)
 
     def joint_centres(self) -> Float64[np.ndarray, "joints 3"]:
         """Where the joints are, metres, world frame."""

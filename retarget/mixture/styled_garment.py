@@ -192,7 +192,7 @@ class WornGarment:
         """The garment in a pose, metres, as fast as a picture is drawn.
 
         It is pushed out of the limbs that carry it, which leaves a few tenths of a percent inside; `outside` leaves
-        next to nothing and takes forty times as long.
+        next to nothing and takes about ten times as long.
         """
         if self._near is None:
             garment, config = self._garment.garment, self._config

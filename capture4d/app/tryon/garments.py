@@ -8,6 +8,7 @@ worn.moving(...), worn.resting(...)                 # in the pose, out of the bo
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +19,8 @@ from jaxtyping import Float, Float32, Float64
 
 from capture4d.app.tryon.push import LivePush
 from capture4d.body.limbs import WornBody
-from capture4d.body.skinning import PosedBody, ShapedBody, skin, with_pose
+from capture4d.body.skinning import PosedBody, ShapedBody, sparse_weights, with_pose
+from capture4d.body.surface_kernels import skin_sparse
 from capture4d.errors import InputError
 from capture4d.geometry.intersection_removal import Penetration
 from capture4d.types import Body, Garment, PoseSequence
@@ -292,7 +294,8 @@ class Fitting:
         weights = tried.garment.skin_weights
         assert weights is not None
         self.worn = tried.worn(beta, style)
-        self._weights, self.faces = weights, tried.garment.template.faces
+        self.faces = tried.garment.template.faces
+        self._cloth_skin, self._body_skin = sparse_weights(weights), _body_skin(tried.body)
         self._body = WornBody(self.worn.person, self.worn.at_rest, weights)
         self._push = LivePush(self._body, self.faces, len(self.worn.at_rest), MARGIN_M)
 
@@ -301,8 +304,9 @@ class Fitting:
     ) -> tuple[Float64[np.ndarray, "verts 3"], Float64[np.ndarray, "skin 3"]]:
         """The garment and the body's surface in the next pose of a motion, metres."""
         body = with_pose(self.worn.person, rotations, translation)
-        skinned = body.vertices()
-        return self._push(skin(self.worn.unposed(body, translation), self._weights, body.transforms), skinned), skinned
+        skinned = skin_sparse(body.corrected(), *self._body_skin, body.transforms)
+        unposed = np.ascontiguousarray(self.worn.unposed(body, translation), np.float64)
+        return self._push(skin_sparse(unposed, *self._cloth_skin, body.transforms), skinned), skinned
 
     def resting(self, poses: PoseSequence) -> tuple[Float64[np.ndarray, "verts 3"], Float64[np.ndarray, "skin 3"]]:
         """The same as `animate` has it in the last of some poses."""
@@ -313,3 +317,9 @@ class Fitting:
     def inside(self, vertices: Float[np.ndarray, "verts 3"], skinned: Float[np.ndarray, "skin 3"]) -> Penetration:
         """How much of it is inside the body, measured as `animate` does."""
         return Penetration.of(self._body.posed(skinned).contacts(np.asarray(vertices, np.float64)))
+
+
+@functools.lru_cache(maxsize=1)
+def _body_skin(body: Body) -> tuple[np.ndarray, np.ndarray]:
+    """`sparse_weights`, once for all people: to sort them takes longer than a frame."""
+    return sparse_weights(body.skin_weights)

@@ -109,5 +109,6 @@ def test_other_points_are_measured_from_the_vertex_beside_them(person) -> None:
     points = np.array([[0.1, -0.5, 0.1], [0.1, -0.5, -0.1]])
     surfaces = worn(person, points, 1).posed(person.vertices)
     surfaces.contacts(points)
-    heights = surfaces.heights(np.array([[0.1, -0.5, 0.07], [0.1, -0.5, -0.09]]), np.array([0, 1], np.int32))
+    numbers = np.array([4, 9])
+    heights = surfaces.heights(np.array([[0.1, -0.5, 0.07], [0.1, -0.5, -0.09]]), np.array([0, 1], np.int32), numbers)
     np.testing.assert_allclose(heights, [-0.01, 0.01], atol=1e-3)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from capture4d.geometry.intersection_removal import Contacts, IntersectionRemoval, Penetration
-from capture4d.geometry.mesh import edge_lengths, edge_stretch, stretch_p99, unique_edges
+from capture4d.geometry.intersection_removal import Contacts, IntersectionRemoval, Penetration, project, sweep_order
+from capture4d.geometry.mesh import edge_lengths, edge_stretch, stretch_p99, unique_edges, vertex_adjacency
 from tests.shapes import tube
 
 
@@ -39,7 +39,7 @@ class Cylinder:
             distance - self.radius, normals, feet, normals, np.where(inside_wall, np.inf, room), inside_wall
         )
 
-    def heights(self, points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+    def heights(self, points: np.ndarray, vertices: np.ndarray, numbers: np.ndarray) -> np.ndarray:
         return self.contacts(points).heights
 
 
@@ -166,3 +166,55 @@ def test_faces_turned_against_the_limb_are_found() -> None:
     flipped = removal(Settings(rounds=0))(one, Cylinder()).flipped
     assert flipped[400]
     assert flipped.sum() < 8
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("size", [1e-4, 3e-3])
+def test_projections_are_those_of_every_edge_and_vertex_in_turn(seed: int, size: float) -> None:
+    """Against loops that look at all of them in every sweep, in their order; to the bit, over two calls."""
+    rng = np.random.default_rng(seed)
+    start = REST + size * rng.standard_normal(REST.shape)
+    adjacency = vertex_adjacency(MESH.faces, len(REST))
+    offsets, around = adjacency.indptr.astype(np.int64), adjacency.indices.astype(np.int32)
+    longest, shortest = 1.01 * LENGTHS, 0.98 * LENGTHS
+    due, travelled = np.full(len(EDGES), -1.0), np.zeros(len(REST))
+    points, wanted = start.copy(), start.copy()
+    for spread in (0.2, 0.0):
+        found = Cylinder(0.113, wall_z=0.117).contacts(points)
+        low, high = np.full(len(REST), 0.002), np.where(found.room < 0.01, found.room, np.inf)
+        planes = found.feet, found.normals, found.outwards, low, high
+        project(
+            points, start, EDGES, longest, shortest, due, travelled, offsets, around, sweep_order(offsets, around),
+            *planes, spread, 4,
+        )  # fmt: skip
+        in_turn(wanted, start, longest, shortest, adjacency, planes, spread)
+        np.testing.assert_array_equal(points, wanted)
+        assert np.abs(points - start).max() > 5e-5
+    assert (due > 0).any(), "some edges were not looked at again"
+
+
+def in_turn(points, start, longest, shortest, adjacency, planes, spread) -> None:
+    """Four sweeps, written plainly."""
+    feet, normals, outwards, low, high = planes
+
+    def along(one: np.ndarray, other: np.ndarray) -> float:
+        return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
+
+    for _ in range(4):
+        for e, (i, j) in enumerate(EDGES):
+            apart = points[i] - points[j]
+            length = np.sqrt(along(apart, apart))
+            share = 0.5 * (np.clip(length, shortest[e], longest[e]) - length) / max(length, 1e-12)
+            points[i] += share * apart
+            points[j] -= share * apart
+        for v in range(len(points)):
+            neighbours = adjacency.indices[adjacency.indptr[v] : adjacency.indptr[v + 1]]
+            total = np.zeros(3)
+            for n in neighbours:
+                total += points[n] - start[n]
+            points[v] += spread * (total / len(neighbours) - points[v] + start[v])
+            height, away = along(normals[v], points[v] - feet[v]), along(outwards[v], points[v] - feet[v])
+            if height < low[v]:
+                points[v] += (low[v] - height) * normals[v]
+            elif away > high[v]:
+                points[v] += (high[v] - away) * outwards[v]

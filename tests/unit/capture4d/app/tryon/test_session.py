@@ -49,6 +49,14 @@ def test_a_push_takes_out_what_is_in(tried: TriedGarment):
     np.testing.assert_allclose(LivePush(worn, faces, len(deep), 0.003)(untouched, skin), untouched, atol=1e-9)
 
 
+def test_a_live_frame_shows_the_body_as_it_is(tried: TriedGarment):
+    fitting = Fitting(tried, tried.first_shape, {})
+    rotations = Session(tried).sliders.rotations({"top x": 20.0})
+    _, skin = fitting.moving(rotations, np.array([0.1, 0.2, 0.3]))
+    wanted = with_pose(fitting.worn.person, rotations, np.array([0.1, 0.2, 0.3])).vertices()
+    np.testing.assert_allclose(skin, wanted, atol=1e-9)
+
+
 def test_a_clip_is_what_animate_writes(tried: TriedGarment, tmp_path: Path):
     poses = some_motion(12, 9)
     save_poses(tmp_path / "clip.npz", poses)
