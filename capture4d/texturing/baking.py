@@ -32,9 +32,9 @@ BESIDE_BORDER = 0.02
 """Weight next to a scan's open border."""
 SMOOTHED = 2
 """How often normals of a scan are averaged with their neighbours': the noise of vertices goes, folds stay."""
-ALIKE_NOISE, ALIKE_SEEN = -0.238, 0.117
-"""Correlation between neighbours of what a step towards the neighbours' mean takes away: where all is noise of each
-vertex, by the step on a regular mesh; and of a print of blobs six spacings wide (`python -m benchmarks texture`)."""
+ALIKE_NOISE, ALIKE_SEEN = -0.2, 0.07
+"""Correlation between neighbours of what a step towards the neighbours' mean takes away: just above that of plain cloth
+(-0.21; -0.22 where all is noise of each vertex), and that of a print of blobs six spacings wide."""
 BLOCK = 1 << 18
 """Places that are looked up together: memory does not grow with the picture."""
 
@@ -120,7 +120,10 @@ def sharpened(
     border[boundary_edges(faces)] = True
     border[faces[border[faces].any(axis=1)]] = True  # they have neighbours that mix cloth with what is beside it
     detail: Any = levels - laplacian_pass(levels, faces, border)
-    a, b, c = (detail[faces[:, corner]] for corner in range(3))
+    size = np.linalg.norm(detail, axis=1)
+    usual = max(float(np.median(size[~border])) if not border.all() else 0.0, 1e-9)
+    capped = detail / np.maximum(size / usual, 1)[:, None]  # the edge of a painted border does not speak for the rest
+    a, b, c = (capped[faces[:, corner]] for corner in range(3))
     alike = (a * b + b * c + c * a).sum() / max(float((a * a + b * b + c * c).sum()), 1e-9)
     share = np.clip((alike - ALIKE_NOISE) / (ALIKE_SEEN - ALIKE_NOISE), 0, 1)
     return np.clip(levels + share * detail, 0, 255).astype(np.float32)
