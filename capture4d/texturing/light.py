@@ -13,6 +13,7 @@ known: the mean over what was seen is 1.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +30,8 @@ ROBUST = 2.0
 """Residuals larger than so many standard deviations lose weight (Cauchy)."""
 TERM_SPREAD, GAIN_SPREAD = 1.0, 0.1
 """Standard deviations of terms and of frames' gains before anything is seen: directions that nobody faces stay at 0."""
+HUE_SPREADS = tuple(0.001 * 2.0**power for power in range(10))
+"""Standard deviations of channels' terms around their mean that are tried: from one hue to none in common."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,17 +84,66 @@ def fit_light(
     rows = np.concatenate([ones, terms, shown], axis=2)
     instruments = np.concatenate([ones, harmonics(smooth), shown], axis=2)
     alike = max(1.0, places * PATCH_M2 / max(area_m2, 1e-9))
-    found, gains, mean = np.zeros((terms.shape[-1], 3)), np.zeros((frames, 3)), np.zeros(3)
+    fits = []
     for channel in range(3):
         values = np.maximum(colours[..., channel].astype(np.float64), DARKEST)
         # A level is the larger part of a logarithm the darker it is.
         precision = np.where(values < BRIGHTEST, weights, 0) * (values / 255) ** 2
-        solution = _random_effects(rows, instruments, np.log(values), precision, alike)
-        found[:, channel] = solution[1 : 1 + terms.shape[-1]]
-        gains[:, channel] = solution[1 + terms.shape[-1] :]
-        total = precision.sum()
-        mean[channel] = np.einsum("tp,tpk,k->", precision, terms, found[:, channel]) / max(total, 1e-12)
+        fits.append(_random_effects(rows, instruments, np.log(values), precision, alike))
+    found, gains = _of_near_hue(fits, terms.shape[-1])
+    # The same places for all channels: what is printed there decides of no hue.
+    told = np.where((colours < BRIGHTEST).all(axis=2), weights, 0)
+    mean = np.einsum("tp,tpk->k", told, terms) @ found / max(float(told.sum()), 1e-12)
     return Light(found, mean), gains - gains.mean(axis=0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fit:
+    """A channel's equations, matrix @ solution = right: a constant, the terms of light, a gain of each frame."""
+
+    matrix: Float64[np.ndarray, "columns columns"]
+    right: Float64[np.ndarray, " columns"]
+    error: float
+    """Variance: the solution's covariance is the matrix' inverse times it."""
+
+
+def _of_near_hue(
+    fits: Sequence[_Fit], count: int
+) -> tuple[Float64[np.ndarray, "terms 3"], Float64[np.ndarray, "frames 3"]]:
+    """Terms and gains of the channels, where lamps are of nearly one hue: terms are normally distributed around their
+    mean over the channels, with the spread under which what was found is likeliest (restricted maximum likelihood:
+    Searle, Casella, McCulloch, Variance Components, 6.6). What is printed is mistaken for light in each channel by
+    itself; lamps of two hues show a spread.
+
+    Args:
+        count: of the terms.
+    """
+    at = np.arange(1, 1 + count)
+    rest = np.setdiff1d(np.arange(len(fits[0].right)), at)
+    found, spread = np.empty((len(fits), count)), np.empty((len(fits), count, count))
+    for channel, fit in enumerate(fits):
+        found[channel] = np.linalg.solve(fit.matrix, fit.right)[at]
+        inverse = fit.error * np.linalg.inv(fit.matrix)[np.ix_(at, at)]
+        values, axes = np.linalg.eigh((inverse + inverse.T) / 2)
+        spread[channel] = (axes * np.maximum(values, 1e-10)) @ axes.T  # instruments leave it nearly symmetric
+
+    def weights_of(hue: float) -> tuple[np.ndarray, np.ndarray, float]:
+        """Inverse covariances around the mean, the mean, and the logarithm of the likelihood."""
+        weights = np.linalg.inv(spread + hue**2 * np.eye(count))
+        total = weights.sum(axis=0)
+        mean = np.linalg.solve(total, np.einsum("cij,cj->i", weights, found))
+        away = found - mean
+        misfit = float(np.einsum("ci,cij,cj->", away, weights, away))
+        return weights, mean, float(np.linalg.slogdet(weights)[1].sum() - np.linalg.slogdet(total)[1]) - misfit
+
+    hue = max(HUE_SPREADS, key=lambda each: weights_of(each)[2])
+    weights, mean, _ = weights_of(hue)
+    terms = mean + hue**2 * np.einsum("cij,cj->ci", weights, found - mean)
+    gains = [
+        np.linalg.solve(fit.matrix[np.ix_(rest, rest)], fit.right[rest] - fit.matrix[np.ix_(rest, at)] @ each)[1:]
+        for fit, each in zip(fits, terms, strict=True)
+    ]
+    return terms.T, np.stack(gains, axis=1)
 
 
 def _random_effects(
@@ -100,8 +152,8 @@ def _random_effects(
     values: Float64[np.ndarray, "frames places"],
     precision: Float64[np.ndarray, "frames places"],
     alike: float,
-) -> Float64[np.ndarray, " columns"]:
-    """Coefficients of rows where each place adds something of its own to all its values.
+) -> _Fit:
+    """Equations of the coefficients of rows, where each place adds something of its own to all its values.
 
     With P the precisions of a place's values and k = A / (E + A sum P), the inverse of its covariance is
     (P - k P 1 1' P) / E; E the variance of a value of precision 1, A that of what places add, `alike` times as large
@@ -112,7 +164,7 @@ def _random_effects(
     weight, error, added = base, 0.02**2, 1.0
     ridge = np.full(rows.shape[-1], TERM_SPREAD**-2)
     ridge[0], ridge[-len(rows) :] = 1e-9, GAIN_SPREAD**-2
-    solution = np.zeros(rows.shape[-1])
+    fit = None
     for _ in range(ROUNDS):
         sums = weight.sum(axis=0)
         keep = added * alike / (error + added * alike * np.maximum(sums, 1e-12))
@@ -120,7 +172,8 @@ def _random_effects(
         heavy = (instruments * weight[..., None]).reshape(-1, rows.shape[-1])
         matrix = heavy.T @ rows.reshape(heavy.shape) - (told * keep[:, None]).T @ by_place
         right = heavy.T @ values.reshape(-1) - told.T @ (keep * (weight * values).sum(axis=0))
-        solution = np.linalg.solve(matrix + np.diag(ridge * error), right)
+        fit = _Fit(matrix + np.diag(ridge * error), right, error)
+        solution = np.linalg.solve(fit.matrix, fit.right)
         residual = values - rows @ solution
         place = (weight * residual).sum(axis=0) / np.maximum(sums, 1e-12)
         left = np.where(weight > 0, residual - place, 0)
@@ -129,4 +182,5 @@ def _random_effects(
         looked = sums > 0
         added = max(float(place[looked].var()), 1e-8) if looked.any() else 1e-8
         weight = base / (1 + base * left**2 / (ROBUST**2 * error))
-    return solution
+    assert fit is not None
+    return fit

@@ -23,6 +23,8 @@ from capture4d.types import PoseSequence
 __all__ = ["BODY", "MOTION", "body_clip", "require_along", "write_body_motion", "write_scans"]
 
 BODY, MOTION, SCANS = "body", "body.bvh", "scans"
+_GREY = (0.35, 0.33, 0.32)
+"""Linear colour of the body: that of no cloth."""
 _MOTION_AGREES_MM = 0.1
 """By how much joints of a motion that is read back may be off: a bvh has four decimals of a degree."""
 
@@ -48,7 +50,7 @@ def body_clip(work: WorkFolder, garment: Clip) -> Clip:
         garment.moving.fps,
         partial(_frames, person, poses),
     )
-    return Clip(moving, Skeleton.create(person, poses, body.skin_weights), None, None, (), name=BODY)
+    return Clip(moving, Skeleton.create(person, poses, body.skin_weights), None, None, (), name=BODY, colour=_GREY)
 
 
 def _person(work: WorkFolder, garment: Clip) -> tuple[ShapedBody, PoseSequence]:

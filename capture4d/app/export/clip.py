@@ -18,7 +18,7 @@ from capture4d.captures.work_folder import WorkFolder, load_registration
 from capture4d.errors import InputError
 from capture4d.files.arrays import map_array
 from capture4d.files.records import load_garment
-from capture4d.mesh_files.animated.moving_mesh import MovingMesh
+from capture4d.mesh_files.animated.moving_mesh import CLOTH_COLOUR, MovingMesh
 from capture4d.runs.frame_lists import chosen_frames, frame_file, listed
 from capture4d.runs.stage import read_record
 from capture4d.types import Garment
@@ -56,6 +56,8 @@ class Clip:
     """What is worth telling, a sentence each."""
     name: str = "garment"
     """Of its files."""
+    colour: tuple[float, float, float] = CLOTH_COLOUR
+    """Linear; seen where there is no picture of its colours."""
 
 
 def read_clip(work: WorkFolder, frames: str = "", *, with_maps: bool = True, albedo: str | None = None) -> Clip:

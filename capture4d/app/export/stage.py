@@ -6,7 +6,7 @@ garment.usdc ...      a file for each format; obj/000123.obj and ply/000123.ply
 body.usdc ...         the body, if it goes along; body.bvh, its motion; scans/000123.ply, those of the take
 normals/000123.png    normal maps, if there are any
 albedo.png            the cloth's colours, if they are known; garment.mtl names it
-open_in_blender.py    opens it with rate, range, material and maps
+open_in_blender.py    opens all of it with rate, range, material, colours and maps
 
 A format is what a frame is to other stages: what is there is not made again, and one more can be added.
 """

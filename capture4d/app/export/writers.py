@@ -74,7 +74,9 @@ def write_format(kind: Format, folder: Path, clip: Clip, config: ExportConfig) -
         case "usd":
             maps = [f"./{map_name(frame_id)}" for frame_id in moving.frame_ids.tolist()] if clip.maps else []
             albedo = f"./{ALBEDO_FILE}" if clip.albedo else None
-            write_usd(path, moving, name=clip.name, maps=maps, albedo=albedo, normals=config.normals)
+            write_usd(
+                path, moving, name=clip.name, maps=maps, albedo=albedo, normals=config.normals, colour=clip.colour
+            )
             _require_no_faults(path, usd_faults(path))
             found = read_usd(path)
         case "abc":
@@ -151,7 +153,9 @@ def _write_glb(path: Path, clip: Clip, config: ExportConfig) -> Written:
     skin = None if skeleton is None else skeleton.scene_skin()
     clock = {"fps": moving.fps, "first_frame": first}
     colours = None if clip.albedo is None else (path.parent / ALBEDO_FILE).read_bytes()
-    scene = AnimatedScene(moving.mesh, times, targets, skin, still, colours, {"capture4d": told}, clock)
+    scene = AnimatedScene(
+        moving.mesh, times, targets, skin, still, colours, {"capture4d": told}, clock, clip.name, clip.colour
+    )
     write_animated_glb(path, scene)
     found = 1000 * largest_glb_difference(path, moving)
     _require_close(path, found, error.max_mm + _GLB_AGREES_MM)

@@ -12,9 +12,11 @@ from capture4d.errors import InputError
 from capture4d.types import Mesh
 from capture4d.value_checks import require_frame_rate, require_frames
 
-__all__ = ["MovingMesh", "even_step", "largest_difference"]
+__all__ = ["CLOTH_COLOUR", "MovingMesh", "even_step", "largest_difference"]
 
 Frames = Callable[[], Iterator[np.ndarray]]
+CLOTH_COLOUR = (0.03, 0.12, 0.58)
+"""Linear colour of what is written without a picture of its colours."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,7 +17,7 @@ from capture4d.errors import InputError
 from capture4d.files.optional_packages import USD, package_module
 from capture4d.files.reading import reading
 from capture4d.geometry.mesh import vertex_normals
-from capture4d.mesh_files.animated.moving_mesh import MovingMesh
+from capture4d.mesh_files.animated.moving_mesh import CLOTH_COLOUR, MovingMesh
 from capture4d.mesh_files.polygons import polygon_mesh
 from capture4d.types import Mesh
 
@@ -25,8 +25,6 @@ __all__ = ["read_usd", "usd_faults", "write_usd"]
 
 _SAVED_AFTER = 200
 """Frames until what was set goes to the disk: memory does not grow with the take."""
-_CLOTH = (0.03, 0.12, 0.58)
-"""Linear colour where there is no other."""
 
 
 def write_usd(
@@ -37,6 +35,7 @@ def write_usd(
     maps: Sequence[str] = (),
     albedo: str | None = None,
     normals: bool = True,
+    colour: tuple[float, float, float] = CLOTH_COLOUR,
 ) -> None:
     """Write a .usdc, .usda or .usd file.
 
@@ -45,6 +44,7 @@ def write_usd(
         maps: normal map of each frame, +Y, as a path relative to the file.
         albedo: picture of the colours, sRGB, likewise.
         normals: author the area-weighted vertex normals of each frame, so that every client shades alike.
+        colour: linear; seen where there is no picture of the colours.
     Raises:
         InputError: usd-core is not installed, or nobody knows the frame rate.
     """
@@ -62,7 +62,7 @@ def write_usd(
     stage.SetDefaultPrim(root.GetPrim())
     mesh = _topology(stage, f"/{name}/mesh", moving.mesh, normals)
     if moving.mesh.uv is not None:
-        look = _material(stage, f"/{name}/material", mesh)
+        look = _material(stage, f"/{name}/material", mesh, colour)
         if maps or albedo is not None:
             _textures(stage, look, moving.frame_ids.tolist(), maps, albedo)
     points, extent, shading = mesh.GetPointsAttr(), mesh.GetExtentAttr(), mesh.GetNormalsAttr()
@@ -104,14 +104,14 @@ def _topology(stage: Any, place: str, mesh: Mesh, normals: bool) -> Any:
     return made
 
 
-def _material(stage: Any, place: str, mesh: Any) -> str:
+def _material(stage: Any, place: str, mesh: Any, colour: tuple[float, float, float]) -> str:
     """A surface of cloth; its place."""
     UsdShade, Sdf, Gf = (package_module(USD, each) for each in ("UsdShade", "Sdf", "Gf"))
     types = Sdf.ValueTypeNames
     look = UsdShade.Material.Define(stage, place)
     surface = UsdShade.Shader.Define(stage, f"{place}/preview")
     surface.CreateIdAttr("UsdPreviewSurface")
-    surface.CreateInput("diffuseColor", types.Color3f).Set(Gf.Vec3f(*_CLOTH))
+    surface.CreateInput("diffuseColor", types.Color3f).Set(Gf.Vec3f(*colour))
     surface.CreateInput("roughness", types.Float).Set(0.85)
     look.CreateSurfaceOutput().ConnectToSource(surface.ConnectableAPI(), "surface")
     UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(look)

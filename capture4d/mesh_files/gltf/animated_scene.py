@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Float32, Int32
 
 from capture4d.files.atomic import write_chunks
+from capture4d.mesh_files.animated.moving_mesh import CLOTH_COLOUR
 from capture4d.types import Mesh
 
 __all__ = ["AnimatedScene", "SceneSkin", "SceneTargets", "write_animated_glb"]
@@ -75,6 +76,10 @@ class AnimatedScene:
     """A PNG, sRGB."""
     asset_extras: Mapping[str, Any] = field(default_factory=dict)
     scene_extras: Mapping[str, Any] = field(default_factory=dict)
+    name: str = "garment"
+    """Of node, mesh and material."""
+    colour: tuple[float, float, float] = CLOTH_COLOUR
+    """Linear; seen where there are no base colours."""
 
 
 class _Buffer:
@@ -117,7 +122,7 @@ def write_animated_glb(path: Path, scene: AnimatedScene) -> None:
     tree: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "capture4d", "extras": dict(scene.asset_extras)},
         "scene": 0,
-        "nodes": [{"name": "garment", "mesh": 0}],
+        "nodes": [{"name": scene.name, "mesh": 0}],
         "meshes": [mesh],
         **_material(buffer, scene),
     }
@@ -173,7 +178,7 @@ def _mesh(buffer: _Buffer, scene: AnimatedScene) -> tuple[np.ndarray, dict[str, 
     attributes["_VERTEX"] = buffer.add(vertex.astype("<f4"), "SCALAR", target=_ARRAY)
     index = buffer.add(corners.reshape(-1).astype("<u4"), "SCALAR", target=_INDICES)
     primitive: dict[str, Any] = {"attributes": attributes, "indices": index, "material": 0}
-    mesh: dict[str, Any] = {"name": "garment", "primitives": [primitive]}
+    mesh: dict[str, Any] = {"name": scene.name, "primitives": [primitive]}
     if len(targets.directions):
         primitive["targets"] = [
             {"POSITION": at_vertices(places, ends=True), "NORMAL": at_vertices(normals)}
@@ -186,11 +191,11 @@ def _mesh(buffer: _Buffer, scene: AnimatedScene) -> tuple[np.ndarray, dict[str, 
 
 def _material(buffer: _Buffer, scene: AnimatedScene) -> dict[str, Any]:
     surface: dict[str, Any] = {
-        "baseColorFactor": [0.03, 0.12, 0.58, 1.0],
+        "baseColorFactor": [*scene.colour, 1.0],
         "metallicFactor": 0.0,
         "roughnessFactor": 0.85,
     }
-    material: dict[str, Any] = {"name": "garment", "doubleSided": True, "pbrMetallicRoughness": surface}
+    material: dict[str, Any] = {"name": scene.name, "doubleSided": True, "pbrMetallicRoughness": surface}
     images: list[dict[str, Any]] = []
     for name, picture in (("normal", scene.normal_map), ("albedo", scene.base_colours)):
         if picture is None:

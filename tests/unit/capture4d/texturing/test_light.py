@@ -57,6 +57,25 @@ def test_nobody_turns_and_different_cloth_is_not_taken_for_light():
     assert (factors[0] / factors[1] < 150 / 75 * 1.5).all()
 
 
+def hue_of(light: Light, normals: np.ndarray) -> float:
+    """By how much channels differ in their logarithms over directions, in the mean."""
+    found = np.log(light.at(normals.reshape(-1, 3)))
+    return float(np.abs(found - found.mean(axis=1, keepdims=True)).mean())
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_lamps_of_one_hue_keep_it_whatever_is_printed_and_those_of_two_do_not(seed: int):
+    rng = np.random.default_rng(seed)
+    normals = turning(6, 400, rng, 15)
+    albedo = np.repeat(rng.uniform(50, 190, (40, 3)), 10, axis=0)[rng.permutation(400)]
+    weights = np.ones((6, 400), np.float32)
+    lambert = np.clip(normals @ np.array([0.3, 0.6, 0.74]), 0, None)[..., None]
+    for warm, least, most in ((0.0, 0.0, 0.001), (0.3, 0.04, 0.08)):
+        lit = albedo * (0.6 + lambert * np.array([0.4 + warm, 0.4, 0.4 - warm])) + rng.normal(0, 1, (6, 400, 3))
+        light, _ = fit_light(lit.astype(np.float32), normals, normals, weights, area_m2=AREA_M2)
+        assert least < hue_of(light, normals) < most
+
+
 def test_even_light_changes_nothing():
     normals = np.random.default_rng(0).standard_normal((10, 3))
     assert np.array_equal(Light.even().at(normals), np.ones((10, 3)))

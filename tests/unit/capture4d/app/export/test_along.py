@@ -46,6 +46,9 @@ def test_the_body_moves_beside_the_garment_with_its_skeleton(work: Path, capsys:
     glb = open_document(exports / "body.glb")
     joints = [glb.entry("nodes", at)["name"] for at in glb.entry("skins", 0)["joints"]]
     assert joints == list(NAMES)
+    assert glb.entry("nodes", 0)["name"] == glb.entry("meshes", 0)["name"] == "body"
+    cloth = open_document(exports / "garment.glb").entry("materials", 0)["pbrMetallicRoughness"]
+    assert glb.entry("materials", 0)["pbrMetallicRoughness"]["baseColorFactor"] != cloth["baseColorFactor"]
     motion = read_motion(exports / "body.bvh", load_body(work / "body" / "body.npz"))
     poses = load_poses(work / "body" / "poses.npz")
     assert np.abs(motion.rotations - poses.rotations).max() < 1e-4
