@@ -34,6 +34,7 @@ from capture4d.errors import InputError
 from capture4d.types import Garment, GarmentScan
 from registration.alignment import align, fit_similarity
 from registration.approach import approach, spread_evenly
+from registration.border_strip import PaintRim
 from registration.config import ApproachConfig, MeshRegistrationConfig, RegistrationConfig, Schedule
 from registration.correspondences import mesh_normals
 from registration.geodesic_signature import Likeness, geodesic_signatures, likeness
@@ -111,10 +112,13 @@ class _Attempt:
 class _Attempts:
     """What has been tried on one pair."""
 
-    def __init__(self, garment: Garment, scan: GarmentScan, config: MeshRegistrationConfig) -> None:
-        self.garment, self.garment_scan, self.config = garment, scan, config
+    def __init__(
+        self, garment: Garment, scan: GarmentScan, config: MeshRegistrationConfig, rim_points: np.ndarray | None
+    ) -> None:
+        self.garment, self.garment_scan, self.config, self.rim_points = garment, scan, config, rim_points
         self.kept = analyse_template(garment, config.registration)
         self.scan = prepare_frame(self.kept, scan, config.registration)
+        self.rim = None if rim_points is None else PaintRim.of(self.kept, rim_points, self.scan.border_points)
         self.made: list[_Attempt] = []
         self.fault: InputError | None = None
 
@@ -202,15 +206,17 @@ def fit_mesh(
     config: MeshRegistrationConfig,
     *,
     landmarks: Landmarks | None = None,
+    rim_points: Float64[np.ndarray, "rim 3"] | None = None,
 ) -> MeshFit:
     """The template on the scan, by the first way that reaches it.
 
     Args:
         garment, scan, start: brought to the size that the settings are made for, metres.
+        rim_points: where the paint of the scan's borders begins, likewise.
     Raises:
         InputError: nothing of the scan lies near the start, and `align` may not move it.
     """
-    tried = _Attempts(garment, scan, config)
+    tried = _Attempts(garment, scan, config, rim_points)
     points = tried.scan.surface.points
     if config.align in ("rigid", "similarity"):
         start = align(start, points, with_scale=config.align == "similarity").apply(start)
@@ -241,7 +247,8 @@ def _keeping_lengths(tried: _Attempts, start: np.ndarray, landmarks: Landmarks |
     def placed(there: np.ndarray, *, turning: bool) -> np.ndarray:
         settled = _settled(tried, there, turning=turning)
         if float(scan.surface.grid.query(settled)[0].mean()) <= SETTLED:
-            return register_frame(analysis, scan, settled, config=_dense_alone(own)).vertices
+            last = _dense_alone(own if tried.rim is None else _borders_alone(own))
+            return register_frame(analysis, scan, settled, config=last).vertices
         for schedule in (STIFF, LOOSE) if turning else (LOOSE,):
             dense = replace(own, dense=replace(own.dense, cold=schedule))
             there = register_frame(analysis, scan, there, config=_dense_alone(dense)).vertices
@@ -302,11 +309,11 @@ def _settled(tried: _Attempts, there: np.ndarray, *, turning: bool) -> np.ndarra
         turning: once more with its limbs turned back, if that brings it nearer.
     """
     analysis, scan, config = tried.kept, tried.scan, tried.config
-    settled = settle(analysis, scan, there, config.settle, config.registration)
+    settled = settle(analysis, scan, there, config.settle, config.registration, rim=tried.rim)
     turned = untwisted(analysis, scan.surface, settled) if turning else None
     if turned is None:
         return settled
-    again = settle(analysis, scan, turned, config.settle, config.registration)
+    again = settle(analysis, scan, turned, config.settle, config.registration, rim=tried.rim)
     return min(settled, again, key=lambda vertices: _misfit(analysis, scan, vertices))
 
 
@@ -324,7 +331,7 @@ def _resized(tried: _Attempts, start: np.ndarray) -> None:
         return
     rest, middle = tried.kept.rest, start.mean(axis=0)
     template = tried.garment.template.with_vertices((factor * rest).astype(np.float32))
-    own = _Attempts(replace(tried.garment, template=template), tried.garment_scan, tried.config)
+    own = _Attempts(replace(tried.garment, template=template), tried.garment_scan, tried.config, tried.rim_points)
     begin = _moved_there(middle + factor * (start - middle), own.scan)
     _keeping_lengths(own, begin, None)
     if own.made:
@@ -372,6 +379,11 @@ def _dense_alone(config: RegistrationConfig) -> RegistrationConfig:
     """Where the template lies on the scan already, nodes only push it about."""
     cold = replace(config.coarse.cold, steps=0)
     return replace(config, coarse=replace(config.coarse, cold=cold))
+
+
+def _borders_alone(config: RegistrationConfig) -> RegistrationConfig:
+    """Borders stay where the rim of their paint has drawn them."""
+    return replace(config, dense=replace(config.dense, cold=replace(config.dense.cold, boundary=(0.0, 0.0))))
 
 
 def _misfit(analysis: TemplateAnalysis, scan: FrameScan, vertices: np.ndarray) -> float:
