@@ -42,6 +42,7 @@ from registration.limb_twist import untwisted
 from registration.mesh_verdict import is_tight, reaches
 from registration.quality import assess
 from registration.register import FrameScan, prepare_frame, register_frame
+from registration.scan_noise import held_against_noise, roughness
 from registration.settling import settle
 from registration.template import TemplateAnalysis, analyse_template
 
@@ -137,6 +138,12 @@ class _Attempts:
         limits = self.config.approach
         alike = found.gap <= limits.signature_gap and limits.signature_size[0] <= found.size <= limits.signature_size[1]
         return (own, found.levelled) if alike else None
+
+    @cached_property
+    def roughness(self) -> tuple[float, float]:
+        """Of the scan, and of the template, metres."""
+        mesh = self.garment_scan.mesh
+        return roughness(mesh.vertices, mesh.faces), roughness(self.kept.rest, self.kept.faces)
 
     @property
     def other_size(self) -> float | None:
@@ -248,7 +255,7 @@ def _keeping_lengths(tried: _Attempts, start: np.ndarray, landmarks: Landmarks |
         settled = _settled(tried, there, turning=turning)
         if float(scan.surface.grid.query(settled)[0].mean()) <= SETTLED:
             last = _dense_alone(own if tried.rim is None else _borders_alone(own))
-            return register_frame(analysis, scan, settled, config=last).vertices
+            return register_frame(analysis, scan, settled, config=held_against_noise(last, *tried.roughness)).vertices
         for schedule in (STIFF, LOOSE) if turning else (LOOSE,):
             dense = replace(own, dense=replace(own.dense, cold=schedule))
             there = register_frame(analysis, scan, there, config=_dense_alone(dense)).vertices
