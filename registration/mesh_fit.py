@@ -13,7 +13,7 @@ from afar are turned back (`untwisted`), and a vertex by vertex stage follows.
 Where `align` may, and a rigid motion brings the template far nearer, these are tried from there as well; from there
 alone if nothing of the scan lies near the start. Then:
 
-    wide       the same with wider votes, where limbs had to swing
+    wide       the same with wider votes, where limbs had to swing that are of the template's own size
     sized      all of these with the template made larger or smaller as a whole, where distances along the scan say so
     soft       growing and shrinking, for what is another of its kind
 
@@ -124,20 +124,23 @@ class _Attempts:
         self.fault: InputError | None = None
 
     @cached_property
-    def _compared(self) -> tuple[np.ndarray, Likeness]:
-        """Signatures of the template's vertices, and what those of the scan's points are beside them."""
-        surface, mesh = self.scan.surface, self.garment_scan.mesh
+    def measured(self) -> Signatures:
+        """Signatures of the template's vertices and of the scan's points, alike or not."""
+        mesh = self.garment_scan.mesh
         own = geodesic_signatures(self.kept.rest, self.kept.faces)
-        other = surface.of_points(geodesic_signatures(mesh.vertices, mesh.faces))
-        return own, likeness(own, self.kept.rest, other, surface.points)
+        return own, self.scan.surface.of_points(geodesic_signatures(mesh.vertices, mesh.faces))
+
+    @cached_property
+    def _likeness(self) -> Likeness:
+        own, other = self.measured
+        return likeness(own, self.kept.rest, other, self.scan.surface.points)
 
     @property
     def signatures(self) -> Signatures | None:
         """Of the template's vertices and of the scan's points; None where the two surfaces are not alike."""
-        own, found = self._compared
-        limits = self.config.approach
+        found, limits = self._likeness, self.config.approach
         alike = found.gap <= limits.signature_gap and limits.signature_size[0] <= found.size <= limits.signature_size[1]
-        return (own, found.levelled) if alike else None
+        return (self.measured[0], found.levelled) if alike else None
 
     @cached_property
     def roughness(self) -> tuple[float, float]:
@@ -148,7 +151,7 @@ class _Attempts:
     @property
     def other_size(self) -> float | None:
         """How much larger the scan is along its surface, where it seems to show another of the template's kind."""
-        found, limits = self._compared[1], self.config.approach
+        found, limits = self._likeness, self.config.approach
         low, high = limits.signature_size
         if low <= found.size <= high or found.gap > OTHER_GAP or not 0.7 < found.size < 1.4:
             return None
@@ -302,7 +305,7 @@ def _keeping_lengths(tried: _Attempts, start: np.ndarray, landmarks: Landmarks |
         moved = _moved_there(start, scan)
     if moved is not start and (near(moved) or far(moved)):
         return moved
-    if tried.swung:
+    if tried.swung and (config.lengths == "kept" or tried.other_size is None):
         begin = tried.best.fit.start if moved is start else moved
         tried.add("wide", begin, lambda: drawn(begin, config.approach.wide, None))
         return begin
@@ -339,6 +342,7 @@ def _resized(tried: _Attempts, start: np.ndarray) -> None:
     rest, middle = tried.kept.rest, start.mean(axis=0)
     template = tried.garment.template.with_vertices((factor * rest).astype(np.float32))
     own = _Attempts(replace(tried.garment, template=template), tried.garment_scan, tried.config, tried.rim_points)
+    own.measured = factor * tried.measured[0], tried.measured[1]
     begin = _moved_there(middle + factor * (start - middle), own.scan)
     _keeping_lengths(own, begin, None)
     if own.made:
