@@ -273,7 +273,6 @@ PAPER = RegistrationConfig(
     sequence=SequenceConfig(start="skinned", relax=0.0),
     colour=ColourConfig(use="off"),
 )
-
 """DeepWrinkles as printed: constant weights, no dense stage."""
 
 PRESETS: Mapping[str, RegistrationConfig] = {"default": RegistrationConfig(), "paper": PAPER}
@@ -328,6 +327,8 @@ class SettleConfig:
     """Weight of lengths along edges against the template's."""
     boundary: tuple[NonNegative, NonNegative] = (0.3, 0.02)
     """Weight of E_bound. The shape knows the border better than painted points that a scan has lost here and there."""
+    rim: NonNegative = 0.1
+    """Weight of the inner rim of the borders' paint in its place, where the paint is equally wide."""
 
 
 @settings

@@ -13,7 +13,7 @@ from afar are turned back (`untwisted`), and a vertex by vertex stage follows.
 Where `align` may, and a rigid motion brings the template far nearer, these are tried from there as well; from there
 alone if nothing of the scan lies near the start. Then:
 
-    wide       the same with wider votes, where limbs had to swing
+    wide       the same with wider votes, where limbs had to swing that are of the template's own size
     sized      all of these with the template made larger or smaller as a whole, where distances along the scan say so
     soft       growing and shrinking, for what is another of its kind
 
@@ -34,6 +34,7 @@ from capture4d.errors import InputError
 from capture4d.types import Garment, GarmentScan
 from registration.alignment import align, fit_similarity
 from registration.approach import approach, spread_evenly
+from registration.border_strip import PaintRim
 from registration.config import ApproachConfig, MeshRegistrationConfig, RegistrationConfig, Schedule
 from registration.correspondences import mesh_normals
 from registration.geodesic_signature import Likeness, geodesic_signatures, likeness
@@ -41,6 +42,7 @@ from registration.limb_twist import untwisted
 from registration.mesh_verdict import is_tight, reaches
 from registration.quality import assess
 from registration.register import FrameScan, prepare_frame, register_frame
+from registration.scan_noise import held_against_noise, roughness
 from registration.settling import settle
 from registration.template import TemplateAnalysis, analyse_template
 
@@ -111,33 +113,45 @@ class _Attempt:
 class _Attempts:
     """What has been tried on one pair."""
 
-    def __init__(self, garment: Garment, scan: GarmentScan, config: MeshRegistrationConfig) -> None:
-        self.garment, self.garment_scan, self.config = garment, scan, config
+    def __init__(
+        self, garment: Garment, scan: GarmentScan, config: MeshRegistrationConfig, rim_points: np.ndarray | None
+    ) -> None:
+        self.garment, self.garment_scan, self.config, self.rim_points = garment, scan, config, rim_points
         self.kept = analyse_template(garment, config.registration)
         self.scan = prepare_frame(self.kept, scan, config.registration)
+        self.rim = None if rim_points is None else PaintRim.of(self.kept, rim_points, self.scan.border_points)
         self.made: list[_Attempt] = []
         self.fault: InputError | None = None
 
     @cached_property
-    def _compared(self) -> tuple[np.ndarray, Likeness]:
-        """Signatures of the template's vertices, and what those of the scan's points are beside them."""
-        surface, mesh = self.scan.surface, self.garment_scan.mesh
+    def measured(self) -> Signatures:
+        """Signatures of the template's vertices and of the scan's points, alike or not."""
+        mesh = self.garment_scan.mesh
         own = geodesic_signatures(self.kept.rest, self.kept.faces)
-        other = surface.of_points(geodesic_signatures(mesh.vertices, mesh.faces))
-        return own, likeness(own, self.kept.rest, other, surface.points)
+        return own, self.scan.surface.of_points(geodesic_signatures(mesh.vertices, mesh.faces))
+
+    @cached_property
+    def _likeness(self) -> Likeness:
+        own, other = self.measured
+        return likeness(own, self.kept.rest, other, self.scan.surface.points)
 
     @property
     def signatures(self) -> Signatures | None:
         """Of the template's vertices and of the scan's points; None where the two surfaces are not alike."""
-        own, found = self._compared
-        limits = self.config.approach
+        found, limits = self._likeness, self.config.approach
         alike = found.gap <= limits.signature_gap and limits.signature_size[0] <= found.size <= limits.signature_size[1]
-        return (own, found.levelled) if alike else None
+        return (self.measured[0], found.levelled) if alike else None
+
+    @cached_property
+    def roughness(self) -> tuple[float, float]:
+        """Of the scan, and of the template, metres."""
+        mesh = self.garment_scan.mesh
+        return roughness(mesh.vertices, mesh.faces), roughness(self.kept.rest, self.kept.faces)
 
     @property
     def other_size(self) -> float | None:
         """How much larger the scan is along its surface, where it seems to show another of the template's kind."""
-        found, limits = self._compared[1], self.config.approach
+        found, limits = self._likeness, self.config.approach
         low, high = limits.signature_size
         if low <= found.size <= high or found.gap > OTHER_GAP or not 0.7 < found.size < 1.4:
             return None
@@ -202,15 +216,17 @@ def fit_mesh(
     config: MeshRegistrationConfig,
     *,
     landmarks: Landmarks | None = None,
+    rim_points: Float64[np.ndarray, "rim 3"] | None = None,
 ) -> MeshFit:
     """The template on the scan, by the first way that reaches it.
 
     Args:
         garment, scan, start: brought to the size that the settings are made for, metres.
+        rim_points: where the paint of the scan's borders begins, likewise.
     Raises:
         InputError: nothing of the scan lies near the start, and `align` may not move it.
     """
-    tried = _Attempts(garment, scan, config)
+    tried = _Attempts(garment, scan, config, rim_points)
     points = tried.scan.surface.points
     if config.align in ("rigid", "similarity"):
         start = align(start, points, with_scale=config.align == "similarity").apply(start)
@@ -241,7 +257,8 @@ def _keeping_lengths(tried: _Attempts, start: np.ndarray, landmarks: Landmarks |
     def placed(there: np.ndarray, *, turning: bool) -> np.ndarray:
         settled = _settled(tried, there, turning=turning)
         if float(scan.surface.grid.query(settled)[0].mean()) <= SETTLED:
-            return register_frame(analysis, scan, settled, config=_dense_alone(own)).vertices
+            last = _dense_alone(own if tried.rim is None else _borders_alone(own))
+            return register_frame(analysis, scan, settled, config=held_against_noise(last, *tried.roughness)).vertices
         for schedule in (STIFF, LOOSE) if turning else (LOOSE,):
             dense = replace(own, dense=replace(own.dense, cold=schedule))
             there = register_frame(analysis, scan, there, config=_dense_alone(dense)).vertices
@@ -288,7 +305,7 @@ def _keeping_lengths(tried: _Attempts, start: np.ndarray, landmarks: Landmarks |
         moved = _moved_there(start, scan)
     if moved is not start and (near(moved) or far(moved)):
         return moved
-    if tried.swung:
+    if tried.swung and (config.lengths == "kept" or tried.other_size is None):
         begin = tried.best.fit.start if moved is start else moved
         tried.add("wide", begin, lambda: drawn(begin, config.approach.wide, None))
         return begin
@@ -302,11 +319,11 @@ def _settled(tried: _Attempts, there: np.ndarray, *, turning: bool) -> np.ndarra
         turning: once more with its limbs turned back, if that brings it nearer.
     """
     analysis, scan, config = tried.kept, tried.scan, tried.config
-    settled = settle(analysis, scan, there, config.settle, config.registration)
+    settled = settle(analysis, scan, there, config.settle, config.registration, rim=tried.rim)
     turned = untwisted(analysis, scan.surface, settled) if turning else None
     if turned is None:
         return settled
-    again = settle(analysis, scan, turned, config.settle, config.registration)
+    again = settle(analysis, scan, turned, config.settle, config.registration, rim=tried.rim)
     return min(settled, again, key=lambda vertices: _misfit(analysis, scan, vertices))
 
 
@@ -324,7 +341,8 @@ def _resized(tried: _Attempts, start: np.ndarray) -> None:
         return
     rest, middle = tried.kept.rest, start.mean(axis=0)
     template = tried.garment.template.with_vertices((factor * rest).astype(np.float32))
-    own = _Attempts(replace(tried.garment, template=template), tried.garment_scan, tried.config)
+    own = _Attempts(replace(tried.garment, template=template), tried.garment_scan, tried.config, tried.rim_points)
+    own.measured = factor * tried.measured[0], tried.measured[1]
     begin = _moved_there(middle + factor * (start - middle), own.scan)
     _keeping_lengths(own, begin, None)
     if own.made:
@@ -372,6 +390,11 @@ def _dense_alone(config: RegistrationConfig) -> RegistrationConfig:
     """Where the template lies on the scan already, nodes only push it about."""
     cold = replace(config.coarse.cold, steps=0)
     return replace(config, coarse=replace(config.coarse, cold=cold))
+
+
+def _borders_alone(config: RegistrationConfig) -> RegistrationConfig:
+    """Borders stay where the rim of their paint has drawn them."""
+    return replace(config, dense=replace(config.dense, cold=replace(config.dense.cold, boundary=(0.0, 0.0))))
 
 
 def _misfit(analysis: TemplateAnalysis, scan: FrameScan, vertices: np.ndarray) -> float:

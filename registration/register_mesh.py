@@ -38,8 +38,9 @@ from registration.quality import FrameQuality, assess
 
 __all__ = ["FindBorder", "MeshRegistration", "register_mesh", "run"]
 
-FindBorder = Callable[..., np.ndarray]
-"""Mesh, colours, paint in; points on the painted border out. `capture4d.extraction.garment.painted_border` is one."""
+FindBorder = Callable[..., tuple[np.ndarray, np.ndarray]]
+"""Mesh, colours, paint in; points on the painted border out, and on the inner rim of its paint.
+`capture4d.extraction.garment.painted_border` is one."""
 
 DIAGONAL = 1.2
 """Diagonal of the template's bounding box while it is registered, metres: a shirt's."""
@@ -194,7 +195,7 @@ def register_mesh(
         start,
         template,
     )
-    garment_scan = _garment_scan(shown, colours, find_border, config, scan_name)
+    garment_scan, rim_points = _garment_scan(shown, colours, find_border, config, scan_name)
     loops = {f"border_{index}": loop for index, loop in enumerate(boundary_loops(template.faces))}
     if config.border_colour and not loops:
         raise InputError(f"{template_name}: expected open borders, for --border-colour is given; found none")
@@ -203,7 +204,7 @@ def register_mesh(
     if landmarks is not None:
         nearest = KDTree(template.vertices).query(landmarks.on_template)[1]
         marks = np.asarray(nearest, np.int64), normalised(landmarks.on_scan)
-    fitted = fit_mesh(garment, garment_scan, start, config, landmarks=marks)
+    fitted = fit_mesh(garment, garment_scan, start, config, landmarks=marks, rim_points=rim_points)
     metres = METRES[config.units if config.units != "auto" else guess_units(template)]
     factor, limits = metres / scale, config.registration.quality
     quality = assess(fitted.analysis, fitted.scan, fitted.vertices, limits, length_factor=factor)
@@ -277,13 +278,13 @@ def _garment_scan(
     find_border: FindBorder | None,
     config: MeshRegistrationConfig,
     name: str,
-) -> GarmentScan:
-    """The whole scan, with the border points that its paint shows."""
+) -> tuple[GarmentScan, np.ndarray | None]:
+    """The whole scan, with the border points that its paint shows; and the paint's inner rim."""
     if not config.border_colour:
         none = np.zeros((0, 3), np.float32)
-        return GarmentScan(submesh(mesh, np.ones(len(mesh.faces), bool))[0], none, np.zeros(0, np.int32), (), 0)
+        return GarmentScan(submesh(mesh, np.ones(len(mesh.faces), bool))[0], none, np.zeros(0, np.int32), (), 0), None
     if colours is None:
         raise InputError(f"{name}: expected a colour per vertex for --border-colour, found none")
     assert find_border is not None, "a painted border needs somebody who finds it"
-    points = find_border(mesh, colours, parse_colour(config.border_colour), source=name)
-    return GarmentScan(mesh, points, np.full(len(points), -1, np.int32), (), 0)
+    points, rim = find_border(mesh, colours, parse_colour(config.border_colour), source=name)
+    return GarmentScan(mesh, points, np.full(len(points), -1, np.int32), (), 0), rim

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy import sparse
 
+from registration.border_strip import PaintRim
 from registration.config import RegistrationConfig, SettleConfig
 from registration.energies import edge_vectors, stretch_term
 from registration.register import FrameScan, anneal, border_terms, data_term
@@ -76,12 +77,15 @@ def settle(
     vertices: Float64[np.ndarray, "verts 3"],
     config: SettleConfig,
     registration: RegistrationConfig,
+    *,
+    rim: PaintRim | None = None,
 ) -> Float64[np.ndarray, "verts 3"]:
     """Turn and slide the template into its place on a scan that it lies on.
 
     Args:
         vertices: where it lies, metres.
         registration: how scan points are matched, and the solver.
+        rim: where the borders' paint begins, in place of the points on the borders themselves.
     """
     shape, rows = TurnedShape.of(analysis), analysis.laplacian_rows
     border_rows = Rows.of_points(analysis.border.vertices)
@@ -92,10 +96,10 @@ def settle(
         gate = anneal(config.gate, *at)
         terms: list[Term] = [
             data_term(analysis, analysis.vertex_rows, scan.surface, vertices, every, gate, registration),
-            *border_terms(
+            *(rim.terms(vertices, config.rim) if rim else border_terms(
                 analysis, border_rows, scan, vertices, anneal(config.boundary, *at), registration.boundary.gate,
                 rule=registration.boundary.dense_rule, along_curve=registration.boundary.along_curve,
-            ),
+            )),
             stretch_term(
                 vertices, analysis.edges, analysis.rest_lengths, weight=anneal(config.stretch, *at), compression=1.0
             ),

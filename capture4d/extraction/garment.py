@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, Float64, UInt8
 from scipy import sparse
 from scipy.sparse import csgraph
 
@@ -29,6 +29,7 @@ from capture4d.errors import InputError
 from capture4d.extraction.band_borders import border_beyond_rim
 from capture4d.extraction.border_loops import loop_order, name_loops, straighten
 from capture4d.extraction.label_edges import sharpen_labels
+from capture4d.extraction.paint_rim import inner_rim
 from capture4d.geometry.mesh_kernels import face_components, open_vertices
 from capture4d.types import GarmentScan, Mesh, Scan
 
@@ -36,6 +37,10 @@ __all__ = ["ColourNotFoundError", "cut_out", "extract_garment", "painted_border"
 
 MIN_SHARE = 1e-3
 """Share of the scan's vertices below which a paint counts as not found."""
+
+
+MOST_SHARE = 0.5
+"""Share of the scan's vertices above which what resembles a paint is the cloth."""
 
 
 MIN_PART = 0.005
@@ -129,20 +134,24 @@ def extract_garment(
 
 def painted_border(
     mesh: Mesh, colours: UInt8[np.ndarray, "verts 3"], paint: Colour, *, source: str = "scan"
-) -> Float32[np.ndarray, "points 3"]:
-    """Points on the border of a scan that is all garment, whatever its colours, but for one paint.
+) -> tuple[Float32[np.ndarray, "points 3"], Float64[np.ndarray, "rim 3"]]:
+    """Points on the border of a scan that is all garment, whatever its colours, but for one paint; and on the inner rim
+    of that paint.
 
     Raises:
         ColourNotFoundError: the paint is not in the scan.
     """
     painted = classify_colours(colours, paint, ()) == GARMENT
+    if painted.mean() > MOST_SHARE:
+        cloth = np.median(colours, axis=0).astype(int).tolist()
+        painted = classify_colours(colours, paint, (), others=((cloth[0], cloth[1], cloth[2]),)) == GARMENT
     if painted.mean() < MIN_SHARE:
         raise ColourNotFoundError(
             f"{source}: border colour {format_colour(paint)} not found: expected at least {100 * MIN_SHARE:g} % of the "
             f"vertices, found {100 * painted.mean():.2g} %"
         )
     labels = settle_labels(mesh.faces, np.where(painted, FIRST_PAINT, GARMENT).astype(np.uint8))
-    return _border_points(mesh, labels, 1)[0]
+    return _border_points(mesh, labels, 1)[0], inner_rim(mesh, colours, labels == FIRST_PAINT)
 
 
 def _require_colours(labels: np.ndarray, garment: Colour | None, paints: tuple[Colour, ...], source: str) -> None:

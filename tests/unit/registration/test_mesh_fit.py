@@ -1,6 +1,7 @@
 """Verdicts on two meshes: what swung is doubted, what was only carried elsewhere is not."""
 
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -124,6 +125,39 @@ def test_what_is_not_reached_from_afar_is_tried_once_more_from_there(
     np.testing.assert_array_equal(tries[0][1], rest)
     assert np.abs(tries[1][1] - rest).max() > 0.005
     assert fitted.way in ("far", "again")
+
+
+@pytest.mark.parametrize(("lengths", "heights"), [("auto", {0.5, 0.6}), ("kept", {0.5})])
+def test_a_scan_of_another_size_is_measured_once_and_not_searched_for_with_wider_votes(
+    lengths: Literal["auto", "kept"],
+    heights: set[float],
+    garment,
+    scan_of,
+    config,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Lengths that are another's are not reached from farther off; the template is made as large instead, if it may."""
+    measured, widths = [], []
+    signatures = mesh_fit.geodesic_signatures
+
+    def approach(analysis, surface, start, votes, **_) -> np.ndarray:
+        widths.append((float(np.ptp(analysis.rest[:, 1])), votes.width[0]))
+        return start
+
+    monkeypatch.setattr(mesh_fit, "geodesic_signatures", lambda *mesh: measured.append(mesh) or signatures(*mesh))
+    monkeypatch.setattr(mesh_fit, "approach", approach)
+    monkeypatch.setattr(mesh_fit, "reaches", lambda *_: False)
+    for known in ("swung", "of_doubtful_size"):
+        monkeypatch.setattr(mesh_fit._Attempts, known, True)
+    once = replace(config, dense=replace(config.dense, cold=replace(config.dense.cold, steps=1)))
+    once = replace(once, coarse=replace(config.coarse, cold=replace(config.coarse.cold, steps=1)))
+    few = MeshRegistrationConfig(lengths=lengths, registration=once, soft=once, settle=SettleConfig(steps=1))
+    larger = unpainted(scan_of(lambda points: 1.25 * points))
+    mesh_fit.fit_mesh(Garment(garment.template, {}), larger, garment.template.vertices.astype(np.float64), few)
+    assert len(measured) == 2
+    assert {round(height, 1) for height, _ in widths} == heights
+    wide = few.approach.wide.width[0]
+    assert ((0.5, wide) in {(round(height, 1), width) for height, width in widths}) == (lengths == "kept")
 
 
 def unpainted(scan: GarmentScan) -> GarmentScan:

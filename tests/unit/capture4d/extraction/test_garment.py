@@ -72,7 +72,7 @@ def test_what_a_ragged_scan_lost_of_the_paint_is_given_back(seed: int) -> None:
     vertices = np.column_stack([grid, np.zeros(len(grid))])[used]
     colours = np.where(vertices[:, 1:2] > border - 0.015, TOP, CLOTH).astype(np.uint8)
     mesh = Mesh(vertices.astype(np.float32), renumbered.reshape(-1, 3).astype(np.int32))
-    found = painted_border(mesh, colours, TOP)
+    found, _ = painted_border(mesh, colours, TOP)
     inside = found[(found[:, 0] > 0.03) & (found[:, 0] < along[-1] - 0.03)]
     ends = [vertices[np.abs(vertices[:, 0] - x) < spacing / 2, 1].max() for x in along]
     assert border - np.mean(ends) > spacing
