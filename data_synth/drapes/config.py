@@ -149,7 +149,7 @@ class SolverConfig:
     still_mm: Positive = 0.1
     """At rest: the mean motion in 1/60 s is below this, millimetres."""
     frames: Annotated[int, Range(least=1, most=100)] = 90
-    """Sixtieths of a second after which a drape that still moves is flagged."""
+    """Sixtieths of a second after which a drape that still moves is flagged; three times as many for what is pinned."""
     keep: Annotated[float, Range(least=0.9, most=1)] = 0.99
     """Share of the velocity that is left after a substep."""
     calm_after_frames: Whole = 16

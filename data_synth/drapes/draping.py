@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from capture4d.body.binding import bind, diffuse, loose_weights, weights_around
 from capture4d.body.skinning import PosedBody, ShapedBody, blend_transforms, skin, unskin, with_pose, with_shape
+from capture4d.geometry.mesh import face_areas
 from capture4d.types import Body
 from data_synth.cloth.panels import Pattern
 from data_synth.cloth.patterns import PanelMesh, grade
@@ -22,18 +23,28 @@ from data_synth.drapes.collision import BodyParts, Wearing
 from data_synth.drapes.config import CLOTHS, HOLDS, STYLES, DrapesConfig, Hold, SolverConfig
 from data_synth.drapes.dressing import base_garment, hung, mirrored
 from data_synth.drapes.garments import GARMENTS, PINNED_M, Garment, panel_vertices, parse_style
-from data_synth.drapes.solver import FRAME_SUBSTEPS, SUBSTEP_S, Planes, Sheet, advance, keep_lengths
+from data_synth.drapes.solver import FRAME_SUBSTEPS, SUBSTEP_S, Planes, Sheet, advance, keep_lengths, push_out
 
 __all__ = ["Drape", "Draper", "part_contacts", "symmetric_person"]
 
 CLOSING_FRAMES, CLOSING_KEEP = 60, 0.95
 """In which panels hung around the body come to lie on it, and the share of the velocity that a substep leaves then."""
-OUT_MARGINS, EXACT = (0.5, 0.45, 0.4, 0.35, 0.3, 0.25, 0.2, 0.15), (3, 7)
-"""Shares of the margin to which vertices are pushed out of the body at the end, in turn with lengths and areas kept,
-and the turns in which the nearest skin is looked for everywhere. What the one undoes of the other gets less."""
+OUT_MARGINS = (0.5, 0.15)
+"""Shares of the margin to which vertices are pushed out of the body at the end, in the first turn and in the last; in
+turn with lengths and areas kept, so that what the one undoes of the other gets less."""
+OUT_TURNS, EXACT_TURNS, OUT_M = 24, 8, 0.003
+"""Number of those turns, the nearest skin is looked for everywhere in every so many, and how far a vertex is pushed in
+one, metres: pushed out all at once, what is pinched between belly and thigh makes slivers of the faces around it."""
+OUT_AREAS = (0.3, 1.8)
+"""Shares of its area within which a face stays when the rest is pushed out after the last turn."""
+AROUND_FRAMES = 8
+"""Sixtieths of a second after which all of the body is looked at again: what slides off one skin may be in another."""
 SWINGING_KEEP = 0.994
 """Share of the velocity that a substep leaves to what is pinned: a pendulum of half a metre is damped critically, and
 with less left it creeps."""
+SWINGING_TIMES = 3
+"""As many times the frames are given to what is pinned: a blade that slides over the trunk comes to rest as slowly with
+any damping, by a half in 40 frames."""
 WEIGHT_SMOOTHING = 20
 """Further diffusion steps on skin weights: places that bend over a wider stretch do not crumple what they hold."""
 OFFSET_SMOOTHING = 12
@@ -180,7 +191,8 @@ class _Fitting:
         start = Wearing.begin(self.parts, self.contacts, points, surface)
         wearing = Wearing(self.parts, self.contacts, start)
         planes = wearing.look_up(points, surface)
-        points = _pushed_out(points, planes, self.solver.margin_m)
+        points = points.copy()
+        push_out(points, planes, margin=self.solver.margin_m)
         worn = self._held(points, start)
         if self.kind.hang is not None:
             velocities = np.zeros_like(points)
@@ -229,11 +241,13 @@ class _Fitting:
         hold = skin(worn.rest, worn.skin_weights, body.transforms), worn.gain
         solver, motion = self.solver, np.inf
         keeps = SWINGING_KEEP if self.kind.pinned else solver.keep
-        frames, calm_after = 0, solver.frames if self.kind.pinned else solver.calm_after_frames
-        wearing.begin_again(positions, surface)
-        while motion >= solver.still_mm and frames < solver.frames:
+        frames, most = 0, solver.frames * (SWINGING_TIMES if self.kind.pinned else 1)
+        calm_after = most if self.kind.pinned else solver.calm_after_frames
+        while motion >= solver.still_mm and frames < most:
             before = positions.copy()
             keep = keeps - (1 - keeps) * max(0, frames - calm_after)
+            if frames % AROUND_FRAMES == 0:
+                wearing.begin_again(positions, surface)
             for _ in range(0, FRAME_SUBSTEPS, solver.contact_substeps):
                 planes = wearing.look_up(positions, surface)
                 advance(
@@ -243,11 +257,25 @@ class _Fitting:
             motion = 1e3 * float(np.linalg.norm(positions - before, axis=1).mean())
             frames += 1
         wearing.begin_again(positions, surface)
-        for done, share in enumerate(OUT_MARGINS):
+        for turn, share in enumerate(np.linspace(*OUT_MARGINS, OUT_TURNS), start=1):
             keep_lengths(self.sheet, positions)
-            look_up = wearing.look_up_exactly if done in EXACT else wearing.look_up
-            positions = _pushed_out(positions, look_up(positions, surface), share * solver.margin_m)
+            planes = (wearing.look_up if turn % EXACT_TURNS else wearing.look_up_exactly)(positions, surface)
+            push_out(positions, planes, margin=share * solver.margin_m, farthest=OUT_M)
+        self._push_the_rest_out(positions, planes)
         return Drape(positions, frames, motion)
+
+    def _push_the_rest_out(self, positions: np.ndarray, planes: Planes) -> None:
+        """All the way, (V, 3) changed in place, but for corners of faces that would not bear it."""
+        pushed, left = positions.copy(), np.zeros(len(positions), bool)
+        push_out(pushed, planes, margin=OUT_MARGINS[1] * self.solver.margin_m)
+        while True:
+            ratios = face_areas(pushed, self.sheet.faces) / self.sheet.areas
+            corners = self.sheet.faces[(ratios < OUT_AREAS[0]) | (ratios > OUT_AREAS[1])].ravel()
+            if left[corners].all():
+                break
+            left[corners] = True
+            pushed[left] = positions[left]
+        positions[:] = pushed
 
     def _held(self, points: np.ndarray, start: np.ndarray) -> _Worn:
         """The garment as it is now in the dressing pose, and how it is held there."""
@@ -320,17 +348,6 @@ def part_contacts(mesh: PanelMesh, panels: np.ndarray, kind: Garment) -> tuple[n
         meets[sewn] = np.arange(parts) == kind.seam
     vertices, met = np.nonzero(meets)
     return vertices.astype(np.int32), met.astype(np.int32)
-
-
-def _pushed_out(points: np.ndarray, planes: Planes, margin: float) -> np.ndarray:
-    """Points moved out of the half planes of their vertices, to a distance from them."""
-    points = points.copy()
-    heights = np.einsum("cx,cx->c", points[planes.vertices] - planes.points, planes.normals) - margin
-    for c in np.flatnonzero(heights < 0):
-        i = planes.vertices[c]
-        height = float((points[i] - planes.points[c]) @ planes.normals[c]) - margin
-        points[i] -= min(height, 0.0) * planes.normals[c]
-    return points
 
 
 def _carried(points: np.ndarray, skin_weights: np.ndarray, start: PosedBody, end: PosedBody) -> np.ndarray:

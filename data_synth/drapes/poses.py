@@ -10,7 +10,7 @@ References: sampling and pruning as in the appendix of Jin et al., A Pixel-Based
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import Delaunay
+from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from capture4d.body.skinning import PosedBody, ShapedBody, with_pose
@@ -142,14 +142,19 @@ def legs_enter(body: PosedBody) -> bool:
         side: [surface[np.char.startswith(owner, name[:8]) & np.char.endswith(owner, f".{side}")] for name in LEG]
         for side, _ in SIDES
     }
-    trunk = Delaunay(surface[np.isin(owner, ("spine03", "spine02", "spine01"))][::3])
-    hulls = {side: [Delaunay(points[::3]) for points in segments[side] if len(points)] for side, _ in SIDES}
+    trunk = ConvexHull(surface[np.isin(owner, ("spine03", "spine02", "spine01"))][::3])
+    hulls = {side: [ConvexHull(points[::3]) for points in segments[side] if len(points)] for side, _ in SIDES}
     for side, other in (("L", "R"), ("R", "L")):
         thigh, *lower = segments[side]
         hip = body.joint_centres()[body.shaped.body.joint_names.index(f"upperleg01.{side}")]
         away = np.linalg.norm(thigh - hip, axis=1)
         leg = np.concatenate([thigh[away > np.median(away)], *lower])  # thighs touch above, in many people at rest
         probes = leg[np.linspace(0, len(leg) - 1, LEG_PROBES).astype(int)]
-        if any((hull.find_simplex(probes) >= 0).any() for hull in (*hulls[other], trunk)):
+        if any(_inside(hull, probes).any() for hull in (*hulls[other], trunk)):
             return True
     return False
+
+
+def _inside(hull: ConvexHull, points: np.ndarray) -> np.ndarray:
+    """(N,) bool: behind all planes of a hull."""
+    return (points @ hull.equations[:, :3].T + hull.equations[:, 3] <= 0).all(axis=1)

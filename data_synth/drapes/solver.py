@@ -25,7 +25,7 @@ from data_synth.cloth.patterns import PanelMesh
 from data_synth.cloth.stencils import hinges, rest_areas, rest_lengths
 from data_synth.drapes.config import Cloth
 
-__all__ = ["FRAME_SUBSTEPS", "SUBSTEP_S", "Planes", "Sheet", "advance", "keep_lengths"]
+__all__ = ["FRAME_SUBSTEPS", "SUBSTEP_S", "Planes", "Sheet", "advance", "keep_lengths", "push_out"]
 
 SUBSTEP_S = 1 / 1440
 FRAME_SUBSTEPS = 24
@@ -171,6 +171,28 @@ def keep_lengths(sheet: Sheet, positions: np.ndarray) -> None:
         positions, sheet.inverse_masses, sheet.edges, sheet.lengths, sheet.edge_firmness * (0, 1, 0),
         *sheet.strain_limits, sheet.faces, sheet.areas, *AREA_LIMITS,
     )  # fmt: skip
+
+
+def push_out(positions: np.ndarray, planes: Planes, *, margin: float, farthest: float = np.inf) -> None:
+    """Move positions, (V, 3) float64 and changed in place, out of the half planes of their vertices.
+
+    Args:
+        margin: distance from them to which they are moved, metres.
+        farthest: no vertex is moved farther by one of its planes, metres.
+    """
+    _push_out(positions, planes.vertices, planes.points, planes.normals, margin, farthest)
+
+
+@njit(cache=True, nogil=True)
+def _push_out(x, touching, plane_points, plane_normals, margin, farthest):
+    for c in range(len(touching)):
+        i, height = touching[c], -margin
+        for k in range(3):
+            height += (x[i, k] - plane_points[c, k]) * plane_normals[c, k]
+        if height < 0:
+            move = min(-height, farthest)
+            for k in range(3):
+                x[i, k] += move * plane_normals[c, k]
 
 
 @njit(cache=True, fastmath=True, nogil=True)

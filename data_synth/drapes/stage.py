@@ -39,7 +39,7 @@ from data_synth.drapes.quality import DrapeQuality, measure_drape
 
 __all__ = ["run", "split_drapes"]
 
-SCHEMA = 3
+SCHEMA = 4
 MEASURES = tuple(each.name for each in fields(DrapeQuality) if each.name != "reasons")
 
 

@@ -48,7 +48,7 @@ from data_synth.styles.style_space import StyleSpace, subspace_cosines, two_roun
 
 __all__ = ["run"]
 
-SCHEMA = 2
+SCHEMA = 3
 FOLDER = "canonical"
 
 

@@ -10,7 +10,7 @@ import pytest
 from capture4d.body.skinning import ShapedBody
 from capture4d.geometry.mesh import edge_lengths
 from capture4d.types import Body
-from data_synth.drapes.config import DrapesConfig
+from data_synth.drapes.config import DrapesConfig, GarmentName, SolverConfig
 from data_synth.drapes.draping import Draper
 
 
@@ -45,6 +45,13 @@ def test_a_garment_is_drafted_for_the_mean_person_or_the_wearer(growing: Body):
     rings = [np.linalg.norm(points - np.roll(points, -1, axis=0), axis=1).sum() for points in worn]
     tight, fitting = np.divide(rings, girths[1:])
     assert tight > 1.03 * fitting
+
+
+@pytest.mark.parametrize(("garment", "frames"), [("skirt", 2), ("necktie", 6)])
+def test_what_swings_is_given_three_times_the_frames(growing: Body, garment: GarmentName, frames: int):
+    config = DrapesConfig(garment=garment, vertices=150, solver=SolverConfig(frames=2, still_mm=1e-9))
+    draper = Draper(config, growing)
+    assert draper.drape(draper.dressing).frames == frames
 
 
 def _ring_length(uv: np.ndarray, faces: np.ndarray, ring: np.ndarray) -> float:

@@ -8,7 +8,7 @@ import pytest
 from data_synth.cloth.panels import Edge, Panel, Pattern, line
 from data_synth.cloth.patterns import PanelMesh, mesh_pattern
 from data_synth.drapes.config import Cloth
-from data_synth.drapes.solver import FRAME_SUBSTEPS, Planes, Sheet, advance, keep_lengths
+from data_synth.drapes.solver import FRAME_SUBSTEPS, Planes, Sheet, advance, keep_lengths, push_out
 
 CLOTH = Cloth()
 NOTHING = Planes(np.zeros(0, np.int32), np.zeros((0, 3)), np.zeros((0, 3)))
@@ -134,3 +134,13 @@ def test_lengths_are_kept_within_their_limits_and_what_is_pinned_stays():
     within = flat(mesh)
     keep_lengths(sheet, within)
     np.testing.assert_array_equal(within, flat(mesh))
+
+
+def test_what_is_too_near_the_body_is_pushed_to_its_distance_and_no_farther_at_once():
+    heights = np.array([-0.01, -0.001, 0.001, 0.02])
+    points = np.column_stack([np.arange(4.0), heights, np.zeros(4)])
+    planes = Planes(np.arange(4, dtype=np.int32), points * (1, 0, 0), np.tile([0.0, 1.0, 0.0], (4, 1)))
+    for farthest, expected in ((0.003, [-0.007, 0.002, 0.002, 0.02]), (np.inf, [0.002, 0.002, 0.002, 0.02])):
+        moved = points.copy()
+        push_out(moved, planes, margin=0.002, farthest=farthest)
+        np.testing.assert_allclose(moved, np.column_stack([points[:, 0], expected, points[:, 2]]), atol=1e-15)
