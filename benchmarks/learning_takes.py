@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.cached_takes import cached_training_set
+from benchmarks.cached_takes import cached_training_set, one_maker
 from benchmarks.renewal import renew
 from capture4d import pipeline
 from capture4d.body.skinning import ShapedBody, with_shape
@@ -71,7 +71,8 @@ def registered_takes(
     for name in names:
         works.append(folder / "works" / name)
         capture = folder / "takes" / name
-        renew(partial(pipeline.run, capture, works[-1], tracked=tracked, draw=False, workers=workers))
+        with one_maker(works[-1]):
+            renew(partial(pipeline.run, capture, works[-1], tracked=tracked, draw=False, workers=workers))
     return works
 
 

@@ -74,7 +74,9 @@ from data_synth.mesh_sequence import open_sequence
 from retarget.shapes.files import load_blendshapes, save_blendshapes
 from wrinkles.normal_maps.pair_files import read_map
 from wrinkles.normal_maps.spaces import encode_png
+from wrinkles.offset_images.editing.config import PictureFormat
 from wrinkles.offset_images.editing.operations import read_operations
+from wrinkles.offset_images.editing.picture_files import read_change, write_picture
 
 __all__ = ["BY_NAME", "KINDS", "Kind", "fault_of", "laid_out", "whole"]
 
@@ -140,6 +142,17 @@ def _materials(path: Path, picture: str = "skin.png") -> None:
 
 def _beside(path: Path) -> Any:
     return read_coloured_mesh(path.with_name("mesh.obj"))
+
+
+_OFFSETS = RNG.standard_normal((8, 8, 3)).astype(np.float32)
+
+
+def _drawn(ending: PictureFormat) -> Kind:
+    def read(path: Path) -> np.ndarray:
+        with tempfile.TemporaryDirectory() as folder:
+            return read_change(path, write_picture(Path(folder) / path.name, _OFFSETS, ending))
+
+    return Kind(f"front.{ending}", lambda path: write_picture(path, _OFFSETS, ending), read)
 
 
 def _normal_map(path: Path) -> None:
@@ -311,6 +324,7 @@ KINDS = [
     Kind("operations.json", lambda path: write_json(path, {"operations": [
         {"do": "paint", "height_cm": 1.5, "stroke": [[0.5, 0.5]]}, {"do": "transfer", "from": "other"}]}),
          read_operations),
+    *(_drawn(ending) for ending in ("tif", "exr", "png")),
     Kind("map.png", _normal_map, read_map),
     Kind("board.png", _board_image, _detect),
     Kind("registration/frames/000001.npz", _registration, _read_registration, names_other=True),

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import KDTree
 
-from benchmarks.cached_takes import cached_take
+from benchmarks.cached_takes import cached_take, one_maker
 from benchmarks.renewal import renew
 from capture4d import pipeline
 from capture4d.cache import user_cache_folder
@@ -25,7 +25,8 @@ def registered_work(config: SynthConfig, *, workers: int) -> tuple[Path, Path]:
     """The capture of a configuration, and a work folder with its garments and registration."""
     capture = cached_take(config, workers=workers)
     work = user_cache_folder() / "works" / capture.name
-    renew(partial(pipeline.run, capture, work, draw=False, workers=workers))
+    with one_maker(work):
+        renew(partial(pipeline.run, capture, work, draw=False, workers=workers))
     return capture, work
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from capture4d.own_packages import claim_names
 
 if TYPE_CHECKING:
+    from capture4d import configs as configs
     from capture4d import pipeline as pipeline
     from capture4d.body.anny import load_anny as load_anny
     from capture4d.body.skinning import pose_frame as pose_frame
@@ -76,7 +77,7 @@ _HOMES = {
     "capture4d.types": "BlendshapeModel Body Garment GarmentScan Mesh PoseSequence RegisteredSequence Rig Scan",
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names.split()}
-__all__ = ["__version__", "pipeline", *_HOME]  # pyright: ignore[reportUnsupportedDunderAll]
+__all__ = ["__version__", "configs", "pipeline", *_HOME]  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:
@@ -84,8 +85,8 @@ def __getattr__(name: str) -> Any:
         from importlib.metadata import version
 
         value = version("capture4d")
-    elif name == "pipeline":
-        value = import_module("capture4d.pipeline")
+    elif name in ("configs", "pipeline"):
+        value = import_module(f"capture4d.{name}")
     elif name in _HOME:
         value = getattr(import_module(_HOME[name]), name)
     else:

@@ -15,7 +15,7 @@ from typing import Any
 
 from capture4d.cache import cache_path, kernel_cache, user_cache_folder, usual_cache_path
 
-__all__ = ["import_anny", "import_open3d", "import_pycolmap", "import_warp", "njit"]
+__all__ = ["import_anny", "import_open3d", "import_pycolmap", "import_warp", "native_stderr_closed", "njit"]
 
 
 @functools.cache
@@ -40,7 +40,7 @@ def import_pycolmap() -> Any:
 @functools.cache
 def import_warp() -> Any:
     """The warp module, initialised. To be called before anything that imports warp itself (newton, anny)."""
-    with _native_stderr_closed():  # on a machine without CUDA its library prints a warning that nothing switches off
+    with native_stderr_closed():  # on a machine without CUDA its library prints a warning that nothing switches off
         import warp
 
         if "WARP_CACHE_PATH" not in os.environ and cache_path() != usual_cache_path():
@@ -92,7 +92,7 @@ def _import_numba() -> Any:
 
 
 @contextlib.contextmanager
-def _native_stderr_closed() -> Iterator[None]:
+def native_stderr_closed() -> Iterator[None]:
     """Drop what native code writes to stderr meanwhile; Python's own exceptions pass."""
     sys.stderr.flush()
     saved = os.dup(2)

@@ -18,7 +18,7 @@ from typing import Literal
 import cv2
 import numpy as np
 from jaxtyping import Float64
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from capture4d.calibration.adjustment import RigEstimate
 from capture4d.calibration.config import RIG_CHECK, RigCheckConfig
@@ -90,7 +90,7 @@ def check_rig(
         covariance = np.zeros((len(rig.names), CAMERA_UNKNOWNS) * 2)
     known = covariance
     scene = _scene(rig, used, board)
-    limit = float(chi2.isf(config.false_alarms / len({view.camera for view in used}), 6))
+    limit = float(chdtri(6, config.false_alarms / len({view.camera for view in used})))
 
     def movement(camera: int, trusted: set[int]) -> _Movement | None:
         return _movement(scene, camera, trusted - {camera}, known, limit, config)

@@ -55,7 +55,7 @@ def list_scans(folder: Path, pattern: str | None = None) -> ScanFiles:
     files = [path for path in _files(folder) if path.suffix.lower() in READABLE and not _is_template(path)]
     found: dict[int, list[Path]] = {}
     for path, number in zip(files, _numbers(files, pattern), strict=True):
-        if number is None or not path.is_file():
+        if number is None:
             continue
         if number > LAST_FRAME:
             raise InputError(
@@ -73,11 +73,19 @@ def list_scans(folder: Path, pattern: str | None = None) -> ScanFiles:
 
 
 def _files(folder: Path) -> list[Path]:
-    """What is in a folder and not hidden, by name."""
+    """The files of a folder that are not hidden, by name."""
     if not folder.is_dir():
         return []
     with os.scandir(folder) as entries:
-        return sorted(folder / entry.name for entry in entries if not entry.name.startswith("."))
+        names = [entry.name for entry in entries if not entry.name.startswith(".") and _is_file(entry)]
+    return [folder / name for name in sorted(names)]
+
+
+def _is_file(entry: os.DirEntry[str]) -> bool:
+    try:
+        return entry.is_file()
+    except OSError:  # a link that leads to itself
+        return False
 
 
 def is_aside(path: Path) -> bool:
@@ -86,7 +94,7 @@ def is_aside(path: Path) -> bool:
 
 
 def _is_template(path: Path) -> bool:
-    return path.parent.name != "scans" and path.stem.lower().startswith("template")
+    return path.stem.lower().startswith("template") and path.parent.name != "scans"
 
 
 def _numbers(files: Sequence[Path], pattern: str | None) -> list[int | None]:

@@ -36,6 +36,7 @@ OPTIONAL = {
     "onnx": "`export-onnx`",
     "onnxruntime": "`export-onnx`",
     "meshmonk": "a peer of `python -m benchmarks registration`",
+    "OpenEXR": "`offsets draw --format exr`",
     "usd-core": "`export --format usd`",
     "viser": "`view` and `tryon`",
 }

@@ -6,6 +6,7 @@ A night of tracking is not worth an hour that a look at a few small files would 
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -129,8 +130,14 @@ def _require_room(capture: Capture, work: Path, vertices: int) -> None:
 
 def _bytes(capture: Capture, work: Path, vertices: int) -> Iterator[float]:
     """What each frame that is not there yet will take at least."""
+    garments, registered = ({*_names(work / stage / "frames")} for stage in ("garment", "registration"))
     for frame_id in capture.frame_ids:
-        if not (work / "garment" / "frames" / f"{frame_id:06d}.npz").is_file():
+        name = f"{frame_id:06d}.npz"
+        if name not in garments:
             yield GARMENT_SHARE * scan_path(capture, frame_id).stat().st_size
-        if not (work / "registration" / "frames" / f"{frame_id:06d}.npz").is_file():
+        if name not in registered:
             yield (12 + BYTES_PER_VERTEX) * vertices
+
+
+def _names(folder: Path) -> list[str]:
+    return os.listdir(folder) if folder.is_dir() else []

@@ -11,7 +11,9 @@ from capture4d.app.compare.config import CompareConfig
 from capture4d.captures.work_folder import AnyWork, Place, opened_work
 from capture4d.runs.run_log import logged_stage
 from capture4d.runs.stage import StageResult
+from capture4d.steps.presets import chosen
 from retarget.config import AnimateConfig, FitConfig
+from retarget.mixture import config as mixture_config
 from retarget.mixture.config import StyleFitConfig, StylesConfig
 from wrinkles.normal_maps import config as wrinkle_config
 from wrinkles.normal_maps.config import ApplyConfig, PairConfig, WrinkleConfig
@@ -52,7 +54,7 @@ def fit(
 def fit_styles(
     styles: Place,
     output: Place,
-    config: StylesConfig | None = None,
+    config: StylesConfig | str | None = None,
     *,
     workers: int = 1,
     overwrite: bool = False,
@@ -61,11 +63,13 @@ def fit_styles(
 
     Args:
         styles: what `synth_drapes` wrote of a style set.
+        config: settings, or the name of a preset.
         workers: torch's threads; the last bits of a network depend on their number.
     """
     from retarget.mixture.stage import run as stage
 
-    return with_card(stage(Path(styles), Path(output), config or StylesConfig(), workers=workers, overwrite=overwrite))
+    settings = chosen(config or StylesConfig(), mixture_config.PRESETS)
+    return with_card(stage(Path(styles), Path(output), settings, workers=workers, overwrite=overwrite))
 
 
 def fit_style(
@@ -145,7 +149,7 @@ def wrinkles_maps(
 def wrinkles_train(
     works: Sequence[AnyWork],
     output: Place,
-    config: WrinkleConfig | None = None,
+    config: WrinkleConfig | str = "small",
     *,
     pairs: PairConfig | None = None,
     workers: int = 1,
@@ -154,13 +158,13 @@ def wrinkles_train(
     """Train the network that turns low maps into high ones; makes their maps if need be.
 
     Args:
-        config: the small preset if None.
+        config: settings, or the name of a preset.
         workers: processes for the maps, threads for the training; equal numbers give equal weights.
     """
     from wrinkles.normal_maps.train_stage import run as stage
 
-    opened, config = [opened_work(work) for work in works], config or wrinkle_config.PRESETS["small"]
-    return with_card(stage(opened, Path(output), config, pairs=pairs, workers=workers, overwrite=overwrite))
+    opened, settings = [opened_work(work) for work in works], chosen(config, wrinkle_config.PRESETS)
+    return with_card(stage(opened, Path(output), settings, pairs=pairs, workers=workers, overwrite=overwrite))
 
 
 @logged_stage("wrinkles apply")

@@ -10,6 +10,8 @@ from capture4d.captures.animations.config import RemovalConfig
 from capture4d.captures.work_folder import AnyWork, Place, opened_work
 from capture4d.runs.run_log import logged_stage
 from capture4d.runs.stage import StageResult
+from capture4d.steps.presets import chosen
+from wrinkles.offset_images import config as offset_config
 from wrinkles.offset_images.config import DrapeOffsetsConfig, OffsetConfig, PredictOffsetsConfig
 from wrinkles.offset_images.editing.config import DrawConfig
 
@@ -37,7 +39,7 @@ def wrinkles_offsets(
 def offsets_train(
     drapes: Place,
     output: Place,
-    config: DrapeOffsetsConfig | None = None,
+    config: DrapeOffsetsConfig | str | None = None,
     *,
     labels: Place | None = None,
     workers: int = 1,
@@ -47,14 +49,15 @@ def offsets_train(
 
     Args:
         drapes: what `synth_drapes` wrote of one style on one person.
+        config: settings, or the name of a preset.
         labels: a .npy with a whole number for each face of the garment: the patch it belongs to.
         workers: torch's threads; the last bits of a network depend on their number.
     """
     from wrinkles.offset_images.train_stage import run as stage
 
     given = None if labels is None else Path(labels)
-    config = config or DrapeOffsetsConfig()
-    return with_card(stage(Path(drapes), Path(output), config, labels=given, workers=workers, overwrite=overwrite))
+    settings = chosen(config or DrapeOffsetsConfig(), offset_config.PRESETS)
+    return with_card(stage(Path(drapes), Path(output), settings, labels=given, workers=workers, overwrite=overwrite))
 
 
 @logged_stage("offsets predict")

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from capture4d.captures.work_folder import Place
-from capture4d.errors import InputError
 from capture4d.runs.run_log import logged_stage
 from capture4d.runs.stage import StageResult
+from capture4d.steps.presets import chosen
 from data_synth.config import PRESETS, TRAINING_SETS, BoardConfig, SynthConfig, TrainingSetConfig
 from data_synth.drapes.config import DrapesConfig
 from data_synth.scanner.config import ScanConfig
@@ -33,11 +33,8 @@ def synth(
     from data_synth.stage import run as stage
     from data_synth.training_set import run as training_set
 
-    if isinstance(config, str):
-        known: dict[str, SynthConfig | TrainingSetConfig] = {**PRESETS, **TRAINING_SETS}
-        if config not in known:
-            raise InputError(f"config: expected one of {', '.join(known)}, found '{config}'")
-        config = known[config]
+    known: dict[str, SynthConfig | TrainingSetConfig] = {**PRESETS, **TRAINING_SETS}
+    config = chosen(config, known)
     if isinstance(config, SynthConfig):
         return stage(Path(output), config, workers=workers, overwrite=overwrite)
     return training_set(Path(output), config, workers=workers, overwrite=overwrite)
@@ -98,13 +95,11 @@ def synth_drapes(
     from data_synth.drapes.stage import run as stage
     from data_synth.styles.stage import run as style_set
 
-    if isinstance(config, str):
-        if config not in STYLE_SETS:
-            raise InputError(f"config: expected one of {', '.join(STYLE_SETS)}, found '{config}'")
-        config = STYLE_SETS[config]
+    known: dict[str, DrapesConfig | StyleSetConfig] = {**STYLE_SETS}
+    config = chosen(config or DrapesConfig(), known)
     if isinstance(config, StyleSetConfig):
         return style_set(Path(output), config, workers=workers, overwrite=overwrite)
 
-    result = stage(Path(output), config or DrapesConfig(), workers=workers, overwrite=overwrite)
+    result = stage(Path(output), config, workers=workers, overwrite=overwrite)
     write_page(result.path)
     return result

@@ -14,9 +14,10 @@ from capture4d.runs.decisions import forget_decisions, take_over_decisions
 from capture4d.runs.processes.pool import kept_workers
 from capture4d.runs.run_log import logged_stage
 from capture4d.runs.stage import StageResult
+from capture4d.steps.presets import chosen
 from capture4d.templates.config import TemplateConfig
 from capture4d.tracking.config import TrackingConfig
-from registration.config import MeshRegistrationConfig, RegistrationConfig
+from registration.config import PRESETS, MeshRegistrationConfig, RegistrationConfig
 
 if TYPE_CHECKING:
     from capture4d.calibration.check import CameraCheck
@@ -73,7 +74,7 @@ def track(
 def register(
     capture: AnyCapture,
     work: AnyWork,
-    config: RegistrationConfig | None = None,
+    config: RegistrationConfig | str = "default",
     *,
     tracked: bool = False,
     workers: int = 1,
@@ -82,13 +83,14 @@ def register(
     """Register the template to every frame whose garment `extract` has cut out: WORK/registration.
 
     Args:
+        config: settings, or the name of a preset.
         tracked: move the template with the body that `track` found, not with the poses that the capture brings.
     """
     from registration.stage import run as stage
 
     folder = path_of(work)
     return stage(
-        opened_capture(capture), folder / "garment", folder / "registration", config or RegistrationConfig(),
+        opened_capture(capture), folder / "garment", folder / "registration", chosen(config, PRESETS),
         body_folder=folder / "body" if tracked else None, workers=workers, overwrite=overwrite,
     )  # fmt: skip
 
@@ -116,7 +118,7 @@ def report(
 def run(
     capture: AnyCapture,
     work: AnyWork,
-    config: RegistrationConfig | None = None,
+    config: RegistrationConfig | str = "default",
     *,
     tracking: TrackingConfig | None = None,
     tracked: bool = False,
@@ -127,6 +129,7 @@ def run(
     """Extract, track if need be, register, report. Stages that are complete cost seconds.
 
     Args:
+        config: settings of `register`, or the name of a preset.
         tracking: settings of `track`.
         tracked: track the body even if the capture brings poses.
         draw: False leaves the report out.
@@ -137,7 +140,7 @@ def run(
     from capture4d.preflight.readiness import require_ready
 
     opened, folder = opened_capture(capture), path_of(work)
-    config, tracking = config or RegistrationConfig(), tracking or TrackingConfig()
+    config, tracking = chosen(config, PRESETS), tracking or TrackingConfig()
     tracked = tracked or needs_tracking(opened)
     require_ready(opened, folder, config, tracking if tracked else None, anew=overwrite)
     anew = made_anew(changes(opened, folder, config, tracking=tracking, tracked=tracked)) if overwrite else ()

@@ -33,8 +33,8 @@ from capture4d.app.export.writers import ALBEDO_FILE, MATERIAL, Written, file_of
 from capture4d.captures.work_folder import WorkFolder
 from capture4d.errors import InputError
 from capture4d.files.atomic import TEMPORARY_SUFFIX, read_json, write_bytes, write_json
+from capture4d.files.optional_packages import ALEMBIC, USD, is_installed
 from capture4d.files.outputs import new_files_in
-from capture4d.mesh_files.animated.optional_packages import ALEMBIC, USD, is_installed
 from capture4d.runs.frame_lists import listed
 from capture4d.runs.progress import progress
 from capture4d.runs.stage import Stage, StageResult, open_stage

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from capture4d.mesh_files.animated.optional_packages import ONNX, package_module
+from capture4d.files.optional_packages import ONNX, package_module
 
 __all__ = ["Graph"]
 

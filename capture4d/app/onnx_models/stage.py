@@ -28,7 +28,7 @@ from capture4d.app.onnx_models.wrinkles import probe_maps, wrinkle_graph
 from capture4d.body.skinning import ShapedBody, skin, with_pose
 from capture4d.errors import InputError
 from capture4d.files.atomic import file_digest, read_json, write_bytes, write_json
-from capture4d.mesh_files.animated.optional_packages import ONNX_RUNTIME, package_module
+from capture4d.files.optional_packages import ONNX_RUNTIME, package_module
 from capture4d.runs.progress import progress
 from capture4d.runs.stage import StageResult, open_stage
 from retarget.animation.bodies import captured_person, retargeted_mean

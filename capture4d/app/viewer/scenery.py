@@ -1,36 +1,21 @@
-"""Light, floor and camera of a page; and the door to viser, which draws it."""
+"""Light, floor and camera of a page that viser draws."""
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
-from capture4d.errors import InputError
+from capture4d.files.optional_packages import VISER, package_module
 
-__all__ = ["VISER", "open_server", "require_viser", "set_scene"]
+__all__ = ["open_server", "set_scene"]
 
-VISER = ("viser", "view")
-"""What is imported, and the extra of this project that installs it."""
 _LIGHTS = {"key": ((1.2, 2.0, 2.4), 1.6), "fill": ((-2.2, 0.6, 1.6), 0.5), "back": ((0.4, 1.6, -2.4), 0.9)}
 """Where lights stand, metres from the subject, and how strong they are."""
 _AMBIENT = 0.5
 _ASIDE = np.array([0.16, 0.0, 0.0])
 """The camera looks so far, of the diagonal of the box, past it: the controls lie over the right of the page."""
-
-
-def require_viser() -> None:
-    """
-    Raises:
-        InputError: viser is not installed; says how it is.
-    """
-    if importlib.util.find_spec(VISER[0]) is None:
-        raise InputError(
-            f"expected the Python package '{VISER[0]}', found none; run: pip install 'capture4d[{VISER[1]}]'"
-        )
 
 
 def open_server(host: str, port: int, title: str) -> Any:
@@ -39,8 +24,7 @@ def open_server(host: str, port: int, title: str) -> Any:
     Raises:
         InputError: viser is not installed; says how it is.
     """
-    require_viser()
-    viser = importlib.import_module(VISER[0])
+    viser = package_module(VISER, "")
     server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
     server.gui.configure_theme(control_width="large", dark_mode=False, show_share_button=False, show_logo=False)
     return server

@@ -70,10 +70,10 @@ class View(_Page, MeshOptions, ProgressOptions):
 
     def __call__(self) -> int:
         from capture4d.app.viewer.previews import prepare
-        from capture4d.app.viewer.scenery import require_viser
         from capture4d.app.viewer.take import open_take
+        from capture4d.files.optional_packages import VISER, require_package
 
-        require_viser()
+        require_package(VISER)
         places = [self.folder] if self.beside is None else [self.folder, self.beside]
         takes = [open_take(place, self.config) for place in places]
         if self.prepare:
@@ -108,10 +108,10 @@ class TryOn(_Page):
     def __call__(self) -> int:
         from capture4d.app.tryon.garments import open_garment
         from capture4d.app.tryon.session import Session
-        from capture4d.app.viewer.scenery import require_viser
         from capture4d.errors import InputError
+        from capture4d.files.optional_packages import VISER, require_package
 
-        require_viser()
+        require_package(VISER)
         for path in self.poses:
             if not path.is_file():
                 raise InputError("no such motion file", where=path)

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from capture4d.errors import InputError
+from capture4d.files.optional_packages import USD, package_module
 from capture4d.files.reading import reading
 from capture4d.geometry.mesh import vertex_normals
 from capture4d.mesh_files.animated.moving_mesh import CLOTH_COLOUR, MovingMesh
-from capture4d.mesh_files.animated.optional_packages import USD, package_module
 from capture4d.mesh_files.polygons import polygon_mesh
 from capture4d.types import Mesh
 

@@ -8,7 +8,7 @@ from capture4d.settings import PowerOfTwo, Range, settings
 
 __all__ = ["DrawConfig", "PictureFormat"]
 
-PictureFormat = Literal["tif", "png"]
+PictureFormat = Literal["tif", "exr", "png"]
 
 
 @settings
@@ -18,5 +18,5 @@ class DrawConfig:
     texels: Annotated[int, Range(least=16), PowerOfTwo] = 256
     """Side of the pictures."""
     format: PictureFormat = "tif"
-    """`tif` keeps float32 centimetres, exactly; `png` has 16 bits over a range that it tells, for programs that know no
-    more."""
+    """`tif` and `exr` (extra `exr`) keep float32 centimetres, exactly; `png` has 16 bits over a range that it tells,
+    for programs that know no more."""

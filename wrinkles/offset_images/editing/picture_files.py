@@ -1,11 +1,13 @@
-"""Offset images as files that other programs open: float TIFF in centimetres, or PNG with 16 bits over a range.
+"""Offset images as files that other programs open: float TIFF or EXR in centimetres, or PNG with 16 bits over a range.
 
-RGB is tangent, bitangent, normal. A PNG tells its range and unit in text chunks; the folder's layout.json does as
-well. A program may write a PNG back with 8 bits.
+RGB is tangent, bitangent, normal. A PNG tells its range and unit in text chunks, an EXR its unit; the folder's
+layout.json does as well. A program may write a PNG back with 8 bits, and an EXR with 16.
 """
 
 from __future__ import annotations
 
+import contextlib
+import io
 import zlib
 from pathlib import Path
 
@@ -15,13 +17,16 @@ from jaxtyping import Float32
 
 from capture4d.errors import InputError
 from capture4d.files.atomic import write_bytes
+from capture4d.files.optional_packages import EXR, package_module
 from capture4d.files.reading import reading
+from capture4d.heavy_imports import native_stderr_closed
 from wrinkles.offset_images.editing.config import PictureFormat
 
 __all__ = ["RANGE_CM", "read_change", "write_picture"]
 
 RANGE_CM = 64.0
 """Of a PNG, half of it below zero: 16 bits err by 0.005 mm."""
+EXR_MAGIC = b"\x76\x2f\x31\x01"
 FULL = {np.dtype(np.uint16): 65535.0, np.dtype(np.uint8): 255.0}
 
 
@@ -29,10 +34,13 @@ def write_picture(path: Path, image: Float32[np.ndarray, "size size 3"], kind: P
     """Write one side.
 
     Returns:
-        The values as the file has them: float32 of a TIFF, uint16 of a PNG.
+        The values as the file has them: float32 of a TIFF and an EXR, uint16 of a PNG.
     Raises:
-        InputError: offsets beyond a PNG's range.
+        InputError: offsets beyond a PNG's range, or an EXR without the package for it.
     """
+    if kind == "exr":
+        _write_exr(path, image)
+        return image
     if kind == "png" and np.abs(image).max(initial=0.0) > RANGE_CM / 2:
         worst = float(np.abs(image).max())
         raise InputError(
@@ -54,28 +62,76 @@ def read_change(path: Path, written: np.ndarray) -> Float32[np.ndarray, "size si
         InputError: the file is missing, damaged, or holds another kind of picture.
     """
     with reading(path, "picture"):
-        data = np.frombuffer(path.read_bytes(), np.uint8)
-        found = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
-        if found is None or found.ndim != 3 or found.shape[2] not in (3, 4):
-            raise InputError("expected a picture with three channels, found none, or a damaged one")
-        found = found[..., 2::-1]
-        if found.shape != written.shape:
-            raise InputError(f"expected {written.shape[1]} x {written.shape[0]} texels as it was drawn, found "
-                             f"{found.shape[1]} x {found.shape[0]}")  # fmt: skip
+        found = _read_exr(path, written.shape) if path.suffix == ".exr" else _read_image(path)
+        _check_size(found.shape, written.shape)
         if written.dtype.kind == "f":
-            if found.dtype.kind != "f":
-                raise InputError(f"expected 32 bits of float in a channel as it was drawn, found {found.dtype}")
-            if not np.isfinite(found).all():
-                raise InputError("expected finite offsets, found others")
-            if _is_clipped(found, written):
-                raise InputError("expected centimetres of any sign, found nothing below 0 or above 1: the program that "
-                                 "wrote it has clipped them; draw with --format png for it")  # fmt: skip
-            return (found.astype(np.float64) - written).astype(np.float32)
+            return _float_change(found, written, halves=path.suffix == ".exr")
         if found.dtype not in FULL:
             raise InputError(f"expected 16 or 8 bits a channel, found {found.dtype}")
         full = FULL[found.dtype]
         before = written if found.dtype == written.dtype else np.round(written / 257.0)
         return (RANGE_CM / full * (found.astype(np.float64) - before)).astype(np.float32)
+
+
+def _check_size(found: tuple[int, ...], drawn: tuple[int, ...]) -> None:
+    if found[:2] != drawn[:2]:
+        raise InputError(f"expected {drawn[1]} x {drawn[0]} texels as it was drawn, found {found[1]} x {found[0]}")
+
+
+def _float_change(found: np.ndarray, written: np.ndarray, *, halves: bool) -> np.ndarray:
+    if found.dtype.kind != "f" or (found.dtype == np.float16 and not halves):
+        raise InputError(f"expected 32 bits of float in a channel as it was drawn, found {found.dtype}")
+    if not np.isfinite(found).all():
+        raise InputError("expected finite offsets, found others")
+    if _is_clipped(found, written):
+        raise InputError("expected centimetres of any sign, found nothing below 0 or above 1: the program that "
+                         "wrote it has clipped them; draw with --format png for it")  # fmt: skip
+    before = written.astype(np.float16) if found.dtype == np.float16 else written
+    return (found.astype(np.float64) - before.astype(np.float64)).astype(np.float32)
+
+
+def _read_image(path: Path) -> np.ndarray:
+    data = np.frombuffer(path.read_bytes(), np.uint8)
+    found = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
+    if found is None or found.ndim != 3 or found.shape[2] not in (3, 4):
+        raise InputError("expected a picture with three channels, found none, or a damaged one")
+    return found[..., 2::-1]
+
+
+def _write_exr(path: Path, image: np.ndarray) -> None:
+    exr = package_module(EXR, "")
+    header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage, "unit": "cm"}
+    with exr.File(header, {"RGB": np.ascontiguousarray(image, np.float32)}) as file:
+        file.write(str(path))
+
+
+def _read_exr(path: Path, drawn: tuple[int, ...]) -> np.ndarray:
+    """Red, green and blue of the first part that has them, of a layer of any name."""
+    exr = package_module(EXR, "")
+    if path.read_bytes()[:4] != EXR_MAGIC:
+        raise InputError("expected an EXR, found none")
+    told = io.StringIO()  # of pixels that cannot be read there is a line, and no error
+    try:
+        with native_stderr_closed(), contextlib.redirect_stdout(told):
+            with exr.File(str(path), header_only=True) as file:
+                for part in file.parts:  # before room is made for its pixels
+                    first, last = part.header["dataWindow"]
+                    width, height = (int(size) for size in np.subtract(last, first, dtype=np.int64) + 1)
+                    _check_size((height, width), drawn)
+            with exr.File(str(path), separate_channels=True) as file:
+                parts = [{name: channel.pixels for name, channel in part.channels.items()} for part in file.parts]
+    except InputError:
+        raise
+    except (RuntimeError, ValueError, MemoryError) as error:
+        raise InputError("expected an EXR, found a damaged one") from error
+    if told.getvalue():
+        raise InputError("expected an EXR, found a damaged one")
+    for channels in parts:
+        for layer in (name.removesuffix("R") for name in channels if name == "R" or name.endswith(".R")):
+            planes = [channels[layer + name] for name in "RGB" if layer + name in channels]
+            if [plane.shape for plane in planes] == 3 * [drawn[:2]]:
+                return np.stack(planes, axis=-1)
+    raise InputError("expected channels R, G and B, found others")
 
 
 def _is_clipped(found: np.ndarray, written: np.ndarray) -> bool:

@@ -2,7 +2,7 @@
 
 A drawn folder holds
 
-front.tif, back.tif (or .png)  offsets, centimetres
+front.tif, back.tif (or .exr, .png)  offsets, centimetres
 offsets.npz                    what was drawn, and what was written: later only differences count
 layout.json                    frame, take, texels, unit, range, space; operations that were applied
 """
@@ -97,7 +97,7 @@ def draw(work: WorkFolder, frame_id: int, output: Path, config: DrawConfig) -> N
         "space": "local",
         "channels": ["tangent", "bitangent", "normal"],
         "unit": "cm",
-        "range_cm": None if config.format == "tif" else [-RANGE_CM / 2, RANGE_CM / 2],
+        "range_cm": None if config.format != "png" else [-RANGE_CM / 2, RANGE_CM / 2],
         "operations": [],
     }
     write_json(output / LAYOUT, notes)
@@ -184,12 +184,13 @@ def _read(folder: Path) -> _Drawn:
         for name in ("frame", "registration"):
             entry(notes, name)
         kind = text(entry(notes, "format"), "format")
-        if kind not in ("tif", "png"):
-            raise InputError(f"format: expected tif or png, found {kind[:40]!r}")
-    chosen: PictureFormat = "tif" if kind == "tif" else "png"
+        known: dict[str, PictureFormat] = {"tif": "tif", "exr": "exr", "png": "png"}
+        if kind not in known:
+            raise InputError(f"format: expected {', '.join(known)}, found {kind[:40]!r}")
+    chosen = known[kind]
     with ArrayFile(folder / OFFSETS) as arrays:
         offsets, front, back = (arrays[name] for name in ("offsets", "front", "back"))
-    wanted = np.dtype(np.float32) if chosen == "tif" else np.dtype(np.uint16)
+    wanted = np.dtype(np.float32) if chosen != "png" else np.dtype(np.uint16)
     whole_file = offsets.ndim == 2 and offsets.shape[1] == 3 and np.isfinite(offsets).all()
     if not whole_file or any(each.shape != (texels, texels, 3) or each.dtype != wanted for each in (front, back)):
         raise InputError(f"expected offsets and two pictures of {texels} texels, found others", where=folder / OFFSETS)

@@ -9,9 +9,9 @@ import pytest
 from capture4d.app.export.albedo import Albedo, write_albedo
 from capture4d.cli.exit_codes import GOOD
 from capture4d.files.atomic import read_json, write_bytes, write_json
+from capture4d.files.optional_packages import USD, is_installed, package_module
 from capture4d.files.pictures import read_picture
 from capture4d.files.records import load_garment, save_garment
-from capture4d.mesh_files.animated.optional_packages import USD, is_installed, package_module
 from capture4d.mesh_files.gltf.accessors import accessor_values
 from capture4d.mesh_files.gltf.document import open_document
 from capture4d.mesh_files.meshes import read_coloured_mesh

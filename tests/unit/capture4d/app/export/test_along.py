@@ -10,8 +10,8 @@ from capture4d.body.skinning import pose_frame, with_shape
 from capture4d.captures.capture import read_capture, read_scan
 from capture4d.cli.exit_codes import BAD_COMMAND_LINE, GOOD
 from capture4d.files.atomic import read_json, write_json
+from capture4d.files.optional_packages import USD, is_installed
 from capture4d.files.records import load_body, load_poses
-from capture4d.mesh_files.animated.optional_packages import USD, is_installed
 from capture4d.mesh_files.animated.point_caches import read_pc2
 from capture4d.mesh_files.animated.usd import read_usd
 from capture4d.mesh_files.gltf.document import open_document

@@ -17,8 +17,8 @@ from capture4d.app.onnx_models.graph import Graph
 from capture4d.app.onnx_models.wrinkles import probe_maps, wrinkle_graph
 from capture4d.body.skinning import skin, with_pose
 from capture4d.errors import InputError
+from capture4d.files.optional_packages import ONNX, ONNX_RUNTIME, is_installed, package_module
 from capture4d.learning.networks import perceptron
-from capture4d.mesh_files.animated.optional_packages import ONNX, ONNX_RUNTIME, is_installed, package_module
 from capture4d.types import Garment
 from retarget.config import AnimateConfig, LstmConfig
 from retarget.mixture.heads import Head, PoseNumbers

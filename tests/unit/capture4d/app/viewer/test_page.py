@@ -11,10 +11,11 @@ import pytest
 from capture4d import pipeline
 from capture4d.app.viewer.page import ViewerPage
 from capture4d.app.viewer.presenter import Presenter
-from capture4d.app.viewer.scenery import open_server, require_viser
+from capture4d.app.viewer.scenery import open_server
 from capture4d.app.viewer.surfaces import Surface, surface_glb
 from capture4d.app.viewer.take import BODY_LAYER, CLOTH_LAYER, PLAIN, SCAN, open_take
 from capture4d.errors import InputError
+from capture4d.files.optional_packages import VISER, require_package
 from tests.moving_garment import write_moving_work
 from tests.waiting import until
 
@@ -132,4 +133,4 @@ def test_two_works_side_by_side(opened: Open, tmp_path: Path):
 def test_without_viser_it_is_said_what_installs_it(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"pip install 'capture4d\[view\]'"):
-        require_viser()
+        require_package(VISER)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 from pathlib import Path
@@ -21,6 +22,9 @@ from wrinkles.offset_images.editing.operations import Operation, apply_operation
 from wrinkles.offset_images.editing.stage import apply, draw, edit
 from wrinkles.offset_images.layout import OffsetLayout
 
+with contextlib.suppress(ImportError):  # an extra
+    import OpenEXR
+
 FRAME, TEXELS = 5, 64
 
 
@@ -29,8 +33,10 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> WorkFolder:
     return open_work(bound_work(tmp_path_factory.mktemp("edits"), 8, bend=0.5))
 
 
-@pytest.fixture(params=["tif", "png"])
+@pytest.fixture(params=["tif", "exr", "png"])
 def drawn(work: WorkFolder, tmp_path: Path, request: pytest.FixtureRequest) -> Path:
+    if request.param == "exr":
+        pytest.importorskip("OpenEXR")
     folder = tmp_path / "drawn"
     folder.mkdir()
     draw(work, FRAME, folder, DrawConfig(TEXELS, request.param))
@@ -38,13 +44,27 @@ def drawn(work: WorkFolder, tmp_path: Path, request: pytest.FixtureRequest) -> P
 
 
 def picture(folder: Path, side: str = "front") -> Path:
-    return next(folder.glob(f"{side}.[tp]*"))
+    return next(folder.glob(f"{side}.[tpe]*"))
 
 
 def pixels(path: Path) -> np.ndarray:
+    """Blue, green, red, as another program reads them."""
+    if path.suffix == ".exr":
+        with OpenEXR.File(str(path)) as file:
+            return np.array(file.channels()["RGB"].pixels)[..., ::-1]
     found = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     assert found is not None
     return found
+
+
+def put(path: Path, image: np.ndarray) -> None:
+    """Write blue, green, red as another program does."""
+    if path.suffix != ".exr":
+        assert cv2.imwrite(str(path), image)
+        return
+    header = {"compression": OpenEXR.PIZ_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, {"RGB": np.ascontiguousarray(image[..., ::-1])}) as file:
+        file.write(str(path))
 
 
 def registered(work: WorkFolder) -> np.ndarray:
@@ -70,8 +90,25 @@ def test_cleared_padding_and_fewer_bits_change_nothing(work: WorkFolder, drawn: 
         image[~shown(work)[..., side]] = 0
         if image.dtype == np.uint16:
             image = np.round(image / 257.0).astype(np.uint8)
-        cv2.imwrite(str(path), image)
+        put(path, image)
     np.testing.assert_array_equal(apply(drawn, work, RemovalConfig()).mesh.vertices, registered(work))
+
+
+def test_an_exr_with_halves_and_more_channels_changes_nothing(work: WorkFolder, tmp_path: Path) -> None:
+    """As Blender and Nuke write them: 16 bits a channel, with alpha, or in a layer of a name."""
+    pytest.importorskip("OpenEXR")
+    for halves, layer in ((True, ""), (False, "View Layer.Combined.")):
+        folder = tmp_path / f"drawn{halves}"
+        folder.mkdir()
+        draw(work, FRAME, folder, DrawConfig(TEXELS, "exr"))
+        for name in ("front", "back"):
+            path = picture(folder, name)
+            image = pixels(path)[..., ::-1].astype(np.float16 if halves else np.float32)
+            planes = {layer + each: np.ascontiguousarray(image[..., at]) for at, each in enumerate("RGB")}
+            planes[layer + "A"] = np.ones_like(planes[layer + "R"])
+            with OpenEXR.File({"type": OpenEXR.scanlineimage}, planes) as file:
+                file.write(str(path))
+        np.testing.assert_array_equal(apply(folder, work, RemovalConfig()).mesh.vertices, registered(work))
 
 
 def test_another_program_moves_the_cloth_by_what_it_adds(work: WorkFolder, drawn: Path) -> None:
@@ -79,9 +116,9 @@ def test_another_program_moves_the_cloth_by_what_it_adds(work: WorkFolder, drawn
     for side, name in enumerate(("front", "back")):
         path = picture(drawn, name)
         image = pixels(path).astype(np.float64)
-        per_cm = 1.0 if path.suffix == ".tif" else 65535 / 64
+        per_cm = 65535 / 64 if path.suffix == ".png" else 1.0
         image[shown(work)[..., side], 0] += 3 * per_cm  # OpenCV's first channel is blue
-        cv2.imwrite(str(path), image.astype(np.float32) if path.suffix == ".tif" else np.round(image).astype(np.uint16))
+        put(path, np.round(image).astype(np.uint16) if path.suffix == ".png" else image.astype(np.float32))
     edited = apply(drawn, work, RemovalConfig(enabled=False))
     moved = np.linalg.norm(edited.mesh.vertices - registered(work), axis=1)
     assert edited.moved_share == 1.0
@@ -163,8 +200,8 @@ def test_a_picture_whose_floats_were_clipped_is_refused(work: WorkFolder, drawn:
     path = picture(drawn)
     if path.suffix == ".png":
         pytest.skip("a PNG holds whole numbers")
-    cv2.imwrite(str(path), np.clip(pixels(path), 0, 1))
-    with pytest.raises(InputError, match=r"front\.tif: .*has clipped them; draw with --format png"):
+    put(path, np.clip(pixels(path), 0, 1))
+    with pytest.raises(InputError, match=r"front\.(tif|exr): .*has clipped them; draw with --format png"):
         apply(drawn, work, RemovalConfig())
 
 
@@ -174,7 +211,7 @@ def test_what_cannot_be_applied_is_told_in_one_line(work: WorkFolder, drawn: Pat
         ("layout.json", {"registration": "0"}, "expected pictures of the registration"),
         ("layout.json", {"texels": 32}, "expected offsets and two pictures of 32 texels"),
         ("layout.json", {"frame": 99}, "found none with number 99"),
-        ("layout.json", {"format": "exr"}, "expected tif or png, found 'exr'"),
+        ("layout.json", {"format": "psd"}, "expected tif, exr, png, found 'psd'"),
     ):
         shutil.copytree(drawn, copy)
         notes = json.loads((copy / name).read_text())
@@ -183,11 +220,15 @@ def test_what_cannot_be_applied_is_told_in_one_line(work: WorkFolder, drawn: Pat
             apply(copy, work, RemovalConfig())
         shutil.rmtree(copy)
     small = cv2.resize(pixels(picture(drawn)), (32, 32))
-    for image, expected in ((small, "expected 64 x 64 texels"), (None, "no such file"), (b"", "three channels")):
+    for image, expected in (
+        (small, "expected 64 x 64 texels"),
+        (None, "no such file"),
+        (b"", "three channels|an EXR, found none"),
+    ):
         shutil.copytree(drawn, copy)
         path = picture(copy)
         if isinstance(image, np.ndarray):
-            cv2.imwrite(str(path), image)
+            put(path, image)
         elif image is None:
             path.unlink()
         else:
