@@ -157,4 +157,5 @@ def legs_enter(body: PosedBody) -> bool:
 
 def _inside(hull: ConvexHull, points: np.ndarray) -> np.ndarray:
     """(N,) bool: behind all planes of a hull."""
-    return (points @ hull.equations[:, :3].T + hull.equations[:, 3] <= 0).all(axis=1)
+    heights = np.asarray(points @ hull.equations[:, :3].T + hull.equations[:, 3])
+    return np.all(heights <= 0, axis=1)
