@@ -23,6 +23,7 @@ from typing import Any, Literal
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.cached_takes import one_maker
 from benchmarks.metric import Metric
 from benchmarks.wrong_bodies import wrong_body_metrics
 from capture4d.cache import user_cache_folder
@@ -124,7 +125,8 @@ def tie_metrics(*, scale: Scale, drapes: Path | None, folder: Path | None, epoch
 def _made(config: DrapesConfig, workers: int) -> Path:
     key = hashlib.sha256(json.dumps([SCHEMA, asdict(config)], sort_keys=True).encode()).hexdigest()[:12]
     folder = user_cache_folder() / "takes" / f"{config.garment}-drapes-{key}"
-    make_drapes(folder, config, workers=workers)
+    with one_maker(folder):
+        make_drapes(folder, config, workers=workers)
     return folder
 
 

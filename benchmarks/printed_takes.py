@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from benchmarks.cached_takes import cached_take
+from benchmarks.cached_takes import cached_take, one_maker
 from capture4d.cache import user_cache_folder
 from capture4d.captures.capture import Capture, read_capture, write_capture_description, write_scan
 from capture4d.captures.truth import read_truth_vertices
@@ -90,8 +90,13 @@ def printed_take(config: SynthConfig, name: PrintName, print_mm: float | None, *
     drawn = cv2.imencode(".png", picture[..., ::-1])[1].tobytes()
     digest = hashlib.sha256(drawn).hexdigest()[:8]
     folder = user_cache_folder() / "printed" / f"{simulated.path.name}-{name}-{digest}"
-    labels = folder / "labels"
-    for place in (folder / "scans", labels):
+    with one_maker(folder):
+        _make(folder, replace(config, print=name, print_mm=print_mm), simulated, drawn, workers)
+    return PrintedTake(folder, folder / "print.png", folder / "labels", logo_circle(plan.template, print_mm))
+
+
+def _make(folder: Path, config: SynthConfig, simulated: Capture, drawn: bytes, workers: int) -> None:
+    for place in (folder / "scans", folder / "labels"):
         place.mkdir(parents=True, exist_ok=True)
     for entry in ("body.npz", "poses.npz", "template.npz", "truth"):
         if not (folder / entry).exists():
@@ -99,11 +104,10 @@ def printed_take(config: SynthConfig, name: PrintName, print_mm: float | None, *
     write_bytes(folder / "print.png", drawn)
     capture = replace(simulated, path=folder, garment_colour=None, files=None)
     missing = [each for each in simulated.frame_ids if not (folder / "scans" / f"{each:06d}.ply").is_file()]
-    prepare = partial(_Scanned.open, replace(config, print=name, print_mm=print_mm), simulated, folder)
-    for _ in run_jobs(_scan, missing, prepare=prepare, workers=workers, label=f"scan {name}"):
+    prepare = partial(_Scanned.open, config, simulated, folder)
+    for _ in run_jobs(_scan, missing, prepare=prepare, workers=workers, label=f"scan {config.print}"):
         pass
     write_capture_description(capture)
-    return PrintedTake(folder, folder / "print.png", labels, logo_circle(plan.template, print_mm))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -21,6 +21,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from benchmarks.cached_takes import one_maker
 from benchmarks.metric import Metric
 from benchmarks.style_use import fit_metrics, frame_metrics, prototype_metrics, solver_metrics
 from capture4d.cache import user_cache_folder
@@ -90,7 +91,8 @@ def _drapes(config: StyleSetConfig, *, fresh: bool, workers: int) -> Path:
     """A style set in the cache folder, made if this machine has not done so before."""
     key = hashlib.sha256(json.dumps([SCHEMA, DRAPES_SCHEMA, asdict(config)], sort_keys=True).encode()).hexdigest()[:12]
     folder = user_cache_folder() / "takes" / f"{config.garment}-styles-{key}"
-    make_styles(folder, config, workers=workers, overwrite=fresh)
+    with one_maker(folder):
+        make_styles(folder, config, workers=workers, overwrite=fresh)
     return folder
 
 

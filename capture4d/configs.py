@@ -71,16 +71,17 @@ def with_values(config: Config, values: Mapping[str, object]) -> Config:
     Raises:
         InputError: there is no such field, or it does not take the value.
     """
-    for path, value in values.items():
-        config = _with_value(config, path, path.split("."), value)
-    return config
+    return _with_values(config, {tuple(path.split(".")): value for path, value in values.items()}, "")
 
 
-def _with_value(config: Any, path: str, names: list[str], value: object) -> Any:
-    name, *rest = names
+def _with_values(config: Any, values: Mapping[tuple[str, ...], object], before: str) -> Any:
+    """All at once: what goes with each other may not go with what was there."""
     known = [field.name for field in dataclasses.fields(config)] if dataclasses.is_dataclass(config) else []
-    if name not in known:
-        expected = f"one of {', '.join(known)}" if known else "no more names"
-        raise InputError(f"{path}: expected {expected}, found '{name}'")
-    chosen: Any = _with_value(getattr(config, name), path, rest, value) if rest else value
-    return cast(Any, dataclasses.replace)(config, **{name: chosen})
+    changed = {}
+    for name in dict.fromkeys(path[0] for path in values):
+        if name not in known:
+            expected = f"one of {', '.join(known)}" if known else "no more names"
+            raise InputError(f"{before}{name}: expected {expected}, found '{name}'")
+        inner = {path[1:]: value for path, value in values.items() if path[0] == name}
+        changed[name] = inner[()] if () in inner else _with_values(getattr(config, name), inner, f"{before}{name}.")
+    return cast(Any, dataclasses.replace)(config, **changed)

@@ -94,6 +94,9 @@ def _import_numba() -> Any:
 @contextlib.contextmanager
 def native_stderr_closed() -> Iterator[None]:
     """Drop what native code writes to stderr meanwhile; Python's own exceptions pass."""
+    if sys.stderr is None:  # of a program without a console
+        yield
+        return
     sys.stderr.flush()
     saved = os.dup(2)
     sink = os.open(os.devnull, os.O_WRONLY)

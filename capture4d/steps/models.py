@@ -68,7 +68,7 @@ def fit_styles(
     """
     from retarget.mixture.stage import run as stage
 
-    settings = chosen(config or StylesConfig(), mixture_config.PRESETS)
+    settings = chosen(config, mixture_config.PRESETS)
     return with_card(stage(Path(styles), Path(output), settings, workers=workers, overwrite=overwrite))
 
 
@@ -149,7 +149,7 @@ def wrinkles_maps(
 def wrinkles_train(
     works: Sequence[AnyWork],
     output: Place,
-    config: WrinkleConfig | str = "small",
+    config: WrinkleConfig | str | None = None,
     *,
     pairs: PairConfig | None = None,
     workers: int = 1,
@@ -158,7 +158,7 @@ def wrinkles_train(
     """Train the network that turns low maps into high ones; makes their maps if need be.
 
     Args:
-        config: settings, or the name of a preset.
+        config: settings, or the name of a preset; the small one if None.
         workers: processes for the maps, threads for the training; equal numbers give equal weights.
     """
     from wrinkles.normal_maps.train_stage import run as stage

@@ -56,7 +56,7 @@ def offsets_train(
     from wrinkles.offset_images.train_stage import run as stage
 
     given = None if labels is None else Path(labels)
-    settings = chosen(config or DrapeOffsetsConfig(), offset_config.PRESETS)
+    settings = chosen(config, offset_config.PRESETS)
     return with_card(stage(Path(drapes), Path(output), settings, labels=given, workers=workers, overwrite=overwrite))
 
 

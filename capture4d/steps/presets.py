@@ -12,12 +12,14 @@ __all__ = ["chosen"]
 Config = TypeVar("Config")
 
 
-def chosen(config: Config | str, presets: Mapping[str, Config]) -> Config:
-    """The settings themselves.
+def chosen(config: Config | str | None, presets: Mapping[str, Config]) -> Config:
+    """The settings themselves; those of the first preset if none are given.
 
     Raises:
         InputError: there is no preset of that name.
     """
+    if config is None:
+        return next(iter(presets.values()))
     if not isinstance(config, str):
         return config
     if config not in presets:

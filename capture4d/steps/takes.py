@@ -74,7 +74,7 @@ def track(
 def register(
     capture: AnyCapture,
     work: AnyWork,
-    config: RegistrationConfig | str = "default",
+    config: RegistrationConfig | str | None = None,
     *,
     tracked: bool = False,
     workers: int = 1,
@@ -118,7 +118,7 @@ def report(
 def run(
     capture: AnyCapture,
     work: AnyWork,
-    config: RegistrationConfig | str = "default",
+    config: RegistrationConfig | str | None = None,
     *,
     tracking: TrackingConfig | None = None,
     tracked: bool = False,

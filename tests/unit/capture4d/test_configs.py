@@ -9,6 +9,7 @@ import pytest
 from capture4d import configs, pipeline
 from capture4d.cli.main import COMMANDS
 from capture4d.errors import InputError
+from capture4d.steps.presets import chosen
 
 
 def hints_of(function: typing.Any) -> dict[str, object]:
@@ -54,6 +55,20 @@ def test_values_are_changed_by_the_path_of_their_field():
     assert (changed.sequence.relax, changed.quality.stretch_fail) == (0.4, 2.0)
     assert dataclasses.replace(changed, sequence=usual.sequence, quality=usual.quality) == usual
     assert usual == configs.RegistrationConfig()  # what was given stays as it is
+
+
+def test_values_that_go_with_each_other_are_changed_at_once():
+    """A partner is refused where the residual is learned."""
+    usual = configs.with_values(configs.PRESETS["offsets train"]["default"], {"residual": True})
+    changed = configs.with_values(usual, {"partner": True, "residual": False})
+    assert (changed.partner, changed.residual) == (True, False)
+    with pytest.raises(InputError, match="residual"):
+        configs.with_values(usual, {"partner": True})
+
+
+@pytest.mark.parametrize("presets", configs.PRESETS.values())
+def test_the_first_preset_is_the_default(presets: dict[str, object]):
+    assert chosen(None, presets) is next(iter(presets.values()))
 
 
 @pytest.mark.parametrize(

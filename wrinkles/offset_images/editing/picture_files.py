@@ -7,7 +7,9 @@ layout.json does as well. A program may write a PNG back with 8 bits, and an EXR
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
+import tempfile
 import zlib
 from pathlib import Path
 
@@ -39,7 +41,7 @@ def write_picture(path: Path, image: Float32[np.ndarray, "size size 3"], kind: P
         InputError: offsets beyond a PNG's range, or an EXR without the package for it.
     """
     if kind == "exr":
-        _write_exr(path, image)
+        write_bytes(path, _exr_bytes(image))
         return image
     if kind == "png" and np.abs(image).max(initial=0.0) > RANGE_CM / 2:
         worst = float(np.abs(image).max())
@@ -62,10 +64,19 @@ def read_change(path: Path, written: np.ndarray) -> Float32[np.ndarray, "size si
         InputError: the file is missing, damaged, or holds another kind of picture.
     """
     with reading(path, "picture"):
-        found = _read_exr(path, written.shape) if path.suffix == ".exr" else _read_image(path)
+        if path.suffix == ".exr":
+            planes = _read_exr(path, written.shape)
+            if all(plane.dtype.kind == "f" for plane in planes):  # each by itself: some may be halves
+                _check_values(np.stack(planes, axis=-1), written)
+                return np.stack([_change(plane, written[..., at]) for at, plane in enumerate(planes)], axis=-1)
+            raise InputError("expected channels of float, found whole numbers")
+        found = _read_image(path)
         _check_size(found.shape, written.shape)
         if written.dtype.kind == "f":
-            return _float_change(found, written, halves=path.suffix == ".exr")
+            if found.dtype != np.float32:
+                raise InputError(f"expected 32 bits of float in a channel as it was drawn, found {found.dtype}")
+            _check_values(found, written)
+            return _change(found, written)
         if found.dtype not in FULL:
             raise InputError(f"expected 16 or 8 bits a channel, found {found.dtype}")
         full = FULL[found.dtype]
@@ -78,16 +89,17 @@ def _check_size(found: tuple[int, ...], drawn: tuple[int, ...]) -> None:
         raise InputError(f"expected {drawn[1]} x {drawn[0]} texels as it was drawn, found {found[1]} x {found[0]}")
 
 
-def _float_change(found: np.ndarray, written: np.ndarray, *, halves: bool) -> np.ndarray:
-    if found.dtype.kind != "f" or (found.dtype == np.float16 and not halves):
-        raise InputError(f"expected 32 bits of float in a channel as it was drawn, found {found.dtype}")
+def _check_values(found: np.ndarray, written: np.ndarray) -> None:
     if not np.isfinite(found).all():
         raise InputError("expected finite offsets, found others")
     if _is_clipped(found, written):
         raise InputError("expected centimetres of any sign, found nothing below 0 or above 1: the program that "
                          "wrote it has clipped them; draw with --format png for it")  # fmt: skip
-    before = written.astype(np.float16) if found.dtype == np.float16 else written
-    return (found.astype(np.float64) - before.astype(np.float64)).astype(np.float32)
+
+
+def _change(found: np.ndarray, written: np.ndarray) -> np.ndarray:
+    """What was added, beside what was written in as many bits."""
+    return (found.astype(np.float64) - written.astype(found.dtype).astype(np.float64)).astype(np.float32)
 
 
 def _read_image(path: Path) -> np.ndarray:
@@ -98,15 +110,25 @@ def _read_image(path: Path) -> np.ndarray:
     return found[..., 2::-1]
 
 
-def _write_exr(path: Path, image: np.ndarray) -> None:
+def _exr_bytes(image: np.ndarray) -> bytes:
+    """Read back, for the library says nothing of a disk that is full."""
     exr = package_module(EXR, "")
     header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage, "unit": "cm"}
-    with exr.File(header, {"RGB": np.ascontiguousarray(image, np.float32)}) as file:
-        file.write(str(path))
+    with tempfile.TemporaryDirectory(prefix="capture4d-exr-") as folder:
+        path = Path(folder) / "offsets.exr"
+        with exr.File(header, {"RGB": np.ascontiguousarray(image, np.float32)}) as file:
+            file.write(str(path))
+        try:
+            whole = np.array_equal(np.stack(_read_exr(path, image.shape), axis=-1), image)
+        except InputError:
+            whole = False
+        if not whole:
+            raise OSError(errno.EIO, "an EXR that was written there cannot be read back", folder)
+        return path.read_bytes()
 
 
-def _read_exr(path: Path, drawn: tuple[int, ...]) -> np.ndarray:
-    """Red, green and blue of the first part that has them, of a layer of any name."""
+def _read_exr(path: Path, drawn: tuple[int, ...]) -> list[np.ndarray]:
+    """Red, green and blue, of kinds of their own, of the first part that has them, of a layer of any name."""
     exr = package_module(EXR, "")
     if path.read_bytes()[:4] != EXR_MAGIC:
         raise InputError("expected an EXR, found none")
@@ -130,7 +152,7 @@ def _read_exr(path: Path, drawn: tuple[int, ...]) -> np.ndarray:
         for layer in (name.removesuffix("R") for name in channels if name == "R" or name.endswith(".R")):
             planes = [channels[layer + name] for name in "RGB" if layer + name in channels]
             if [plane.shape for plane in planes] == 3 * [drawn[:2]]:
-                return np.stack(planes, axis=-1)
+                return planes
     raise InputError("expected channels R, G and B, found others")
 
 

@@ -19,6 +19,7 @@ from capture4d.mesh_files.meshes import read_mesh
 from tests.unit.wrinkles.offset_images.test_stage import bound_work
 from wrinkles.offset_images.editing.config import DrawConfig
 from wrinkles.offset_images.editing.operations import Operation, apply_operation, brush, parse_operations, smoothed
+from wrinkles.offset_images.editing.picture_files import write_picture
 from wrinkles.offset_images.editing.stage import apply, draw, edit
 from wrinkles.offset_images.layout import OffsetLayout
 
@@ -97,18 +98,30 @@ def test_cleared_padding_and_fewer_bits_change_nothing(work: WorkFolder, drawn: 
 def test_an_exr_with_halves_and_more_channels_changes_nothing(work: WorkFolder, tmp_path: Path) -> None:
     """As Blender and Nuke write them: 16 bits a channel, with alpha, or in a layer of a name."""
     pytest.importorskip("OpenEXR")
-    for halves, layer in ((True, ""), (False, "View Layer.Combined.")):
+    for halves, layer in (("RGB", ""), ("", "View Layer.Combined."), ("GB", "")):
         folder = tmp_path / f"drawn{halves}"
         folder.mkdir()
         draw(work, FRAME, folder, DrawConfig(TEXELS, "exr"))
         for name in ("front", "back"):
             path = picture(folder, name)
-            image = pixels(path)[..., ::-1].astype(np.float16 if halves else np.float32)
-            planes = {layer + each: np.ascontiguousarray(image[..., at]) for at, each in enumerate("RGB")}
+            image = pixels(path)[..., ::-1]
+            planes = {
+                layer + each: image[..., at].astype(np.float16 if each in halves else np.float32)
+                for at, each in enumerate("RGB")
+            }
             planes[layer + "A"] = np.ones_like(planes[layer + "R"])
             with OpenEXR.File({"type": OpenEXR.scanlineimage}, planes) as file:
                 file.write(str(path))
         np.testing.assert_array_equal(apply(folder, work, RemovalConfig()).mesh.vertices, registered(work))
+
+
+def test_an_exr_that_the_disk_has_no_room_for_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The library writes what fits and returns as if nothing were."""
+    pytest.importorskip("OpenEXR")
+    monkeypatch.setattr(OpenEXR.File, "write", lambda _, path: Path(path).write_bytes(b"v/1\x01"))
+    with pytest.raises(OSError, match="cannot be read back"):
+        write_picture(tmp_path / "front.exr", np.ones((8, 8, 3), np.float32), "exr")
+    assert not (tmp_path / "front.exr").exists()
 
 
 def test_another_program_moves_the_cloth_by_what_it_adds(work: WorkFolder, drawn: Path) -> None:
