@@ -36,3 +36,11 @@ def test_blenders_own_command_line_names_no_file_of_the_export(script: Path, mon
     after = ("blender", "-P", str(script), "--", "garment.abc")
     assert said(script, monkeypatch, *after) == nothing + "garment.abc"
     assert said(script, monkeypatch, str(script), "garment.glb", wheel=True) == nothing + "garment.glb"
+
+
+@pytest.mark.parametrize(("given", "found"), [((), "nothing"), (("many",), "many"), (("-1",), "-1")])
+def test_scans_without_a_number_are_one_line(
+    given: tuple[str, ...], found: str, script: Path, monkeypatch: pytest.MonkeyPatch
+):
+    line = said(script, monkeypatch, "blender", "-P", str(script), "--", "--scans", *given)
+    assert line == f"capture4d: --scans: expected a number, found {found}"
