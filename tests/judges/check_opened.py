@@ -97,9 +97,11 @@ if os.path.isdir(os.path.join(here, "normals")):
     if bump is None or bump.image.source != "SEQUENCE" or not bump.image_user.use_auto_refresh:
         faults.append("no image sequence")
     else:
-        for number, frame in zip(ids, frames, strict=True):
+        for frame in range(frames[0], frames[-1] + 1):
+            number = max(each for each, row in zip(ids, frames, strict=True) if row <= frame)
             scene.frame_set(frame)
-            user = bump.image_user
+            garment = largest("garment").evaluated_get(bpy.context.evaluated_depsgraph_get())
+            user = garment.active_material.node_tree.nodes[bump.name].image_user
             at = min(frame - user.frame_start + 1, user.frame_duration) + user.frame_offset
             if at != number:
                 faults.append(f"at frame {frame} the picture is {at}, not {number}")
