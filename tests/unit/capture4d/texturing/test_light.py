@@ -118,3 +118,15 @@ def test_where_nothing_tells_of_light_it_is_even(level: int, weight: int):
     assert not light.terms.any()
     assert not light.mean.any()
     assert not gains.any()
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("red", [600, 300, 250])
+def test_what_clipped_in_one_channel_changes_the_brightness_of_no_other(red: float, seed: int):
+    """From everywhere to the half that faces the lamp: green and blue are as bright as if red were dark."""
+    colours, normals, lit = worn((red, 120, 90), seed)
+    colours[0, normals[0, :, 2].argmin(), 0] = 240  # one place that all channels show
+    assert 0 < (colours[..., 0] < 250).mean() < 0.7
+    light, _ = fit_light(colours, normals, normals, np.ones((6, 400), np.float32), area_m2=AREA_M2)
+    away = np.log(light.at(normals.reshape(-1, 3)).reshape(lit.shape) / lit)[..., 1:]
+    assert np.abs(away.mean(axis=(0, 1))).max() < 0.01
