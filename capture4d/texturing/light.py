@@ -23,6 +23,8 @@ __all__ = ["Light", "fit_light"]
 
 DARKEST, BRIGHTEST = 6.0, 250.0
 """Levels that are taken for the darkest: logarithms of less are noise; and from which on a camera may have clipped."""
+TOLD_SHARE = 0.1
+"""A channel tells of light if more than so much of what was seen has not clipped; else its levels are left alone."""
 PATCH_M2 = 0.03**2
 """Colours of cloth are alike over so much of it: places in one patch are one place, as far as comparing goes."""
 ROUNDS = 4
@@ -75,7 +77,8 @@ def fit_light(
         weights: 0 where nothing is seen.
         area_m2: of the cloth.
     Returns:
-        The light; and by what each frame is brighter than the mean, as a logarithm.
+        The light; and by what each frame is brighter than the mean, as a logarithm. Both 0 in channels that have
+        clipped nearly everywhere: what is flat has no shade that could be divided out.
     """
     frames, places = weights.shape
     terms = harmonics(normals)
@@ -84,16 +87,20 @@ def fit_light(
     rows = np.concatenate([ones, terms, shown], axis=2)
     instruments = np.concatenate([ones, harmonics(smooth), shown], axis=2)
     alike = max(1.0, places * PATCH_M2 / max(area_m2, 1e-9))
+    clear = np.where(colours < BRIGHTEST, weights[..., None], 0)
+    told = np.flatnonzero(clear.sum(axis=(0, 1)) > TOLD_SHARE * weights.sum())
     fits = []
-    for channel in range(3):
+    for channel in told:
         values = np.maximum(colours[..., channel].astype(np.float64), DARKEST)
         # A level is the larger part of a logarithm the darker it is.
-        precision = np.where(values < BRIGHTEST, weights, 0) * (values / 255) ** 2
+        precision = clear[..., channel] * (values / 255) ** 2
         fits.append(_random_effects(rows, instruments, np.log(values), precision, alike))
-    found, gains = _of_near_hue(fits, terms.shape[-1])
-    # The same places for all channels: what is printed there decides of no hue.
-    told = np.where((colours < BRIGHTEST).all(axis=2), weights, 0)
-    mean = np.einsum("tp,tpk->k", told, terms) @ found / max(float(told.sum()), 1e-12)
+    found, gains = np.zeros((terms.shape[-1], 3)), np.zeros((frames, 3))
+    if fits:
+        found[:, told], gains[:, told] = _of_near_hue(fits, terms.shape[-1])
+    # The same places for all channels: what is printed there decides of no hue. Those that have clipped, too: they face
+    # the lamps, and without them the rest would be too bright.
+    mean = np.einsum("tp,tpk->k", weights, terms) @ found / max(float(weights.sum()), 1e-12)
     return Light(found, mean), gains - gains.mean(axis=0)
 
 
@@ -109,7 +116,7 @@ class _Fit:
 
 def _of_near_hue(
     fits: Sequence[_Fit], count: int
-) -> tuple[Float64[np.ndarray, "terms 3"], Float64[np.ndarray, "frames 3"]]:
+) -> tuple[Float64[np.ndarray, "terms channels"], Float64[np.ndarray, "frames channels"]]:
     """Terms and gains of the channels, where lamps are of nearly one hue: terms are normally distributed around their
     mean over the channels, with the spread under which what was found is likeliest (restricted maximum likelihood:
     Searle, Casella, McCulloch, Variance Components, 6.6). What is printed is mistaken for light in each channel by

@@ -1,8 +1,10 @@
 """What Blender shows after open_in_blender.py: vertices, rate, range, pictures and scans that follow the timeline.
 
     python check_opened.py open_in_blender.py VERTICES.npy FPS FILE     # with the bpy wheel
+    python check_opened.py open_in_blender.py VERTICES.npy FPS FILE --as-blender
 
-FILE: a name beside the script. A file body.npy beside VERTICES.npy has the body's vertices. Scans, if there are any,
+FILE: a name beside the script. --as-blender: the script is told what `blender -P open_in_blender.py` tells it, and FILE
+is what it should find by itself. A file body.npy beside VERTICES.npy has the body's vertices. Scans, if there are any,
 have the garment's vertices, and as red of all of them the row of their frame. Exit code 1 on a mismatch.
 """
 
@@ -20,7 +22,21 @@ here, faults = os.path.dirname(script), []
 with open(os.path.join(here, "export.json"), encoding="utf-8") as file:
     told = json.load(file)
 ids = told["frames"]
-sys.argv = [script, "--", name]
+
+
+class Blender:
+    """bpy.app as it is in Blender itself."""
+
+    module = False
+
+    def __getattr__(self, attribute, real=bpy.app):
+        return getattr(real, attribute)
+
+
+if "--as-blender" in sys.argv:
+    sys.argv, bpy.app = ["blender", "-P", script], Blender()
+else:
+    sys.argv = [script, "--", name]
 runpy.run_path(script, run_name="__main__")
 
 scene, collections = bpy.context.scene, bpy.data.collections
@@ -81,9 +97,11 @@ if os.path.isdir(os.path.join(here, "normals")):
     if bump is None or bump.image.source != "SEQUENCE" or not bump.image_user.use_auto_refresh:
         faults.append("no image sequence")
     else:
-        for number, frame in zip(ids, frames, strict=True):
+        for frame in range(frames[0], frames[-1] + 1):
+            number = max(each for each, row in zip(ids, frames, strict=True) if row <= frame)
             scene.frame_set(frame)
-            user = bump.image_user
+            garment = largest("garment").evaluated_get(bpy.context.evaluated_depsgraph_get())
+            user = garment.active_material.node_tree.nodes[bump.name].image_user
             at = min(frame - user.frame_start + 1, user.frame_duration) + user.frame_offset
             if at != number:
                 faults.append(f"at frame {frame} the picture is {at}, not {number}")

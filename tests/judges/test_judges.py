@@ -133,6 +133,14 @@ def test_the_script_shows_colours_body_and_scans_of_a_take_with_gaps(kind: str, 
     judged(BLENDER, HERE / "check_opened.py", script, vertices, 25, f"garment.{kind}")
 
 
+@needs_blender
+def test_the_script_finds_the_first_file_by_itself_in_blender(gathered: Path):
+    exports = gathered / "work" / "exports"
+    first = next(f"garment.{kind}" for kind in ("usdc", "abc", "glb") if (exports / f"garment.{kind}").is_file())
+    script, vertices = exports / "open_in_blender.py", gathered / "vertices.npy"
+    judged(BLENDER, HERE / "check_opened.py", script, vertices, 25, first, "--as-blender")
+
+
 @needs_browser
 def test_three_js_shows_what_was_exported_and_the_validator_finds_no_error(exported: tuple[Path, float, int]):
     folder, fps, _ = exported

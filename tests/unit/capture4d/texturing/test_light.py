@@ -85,3 +85,48 @@ def test_harmonics_have_no_mean_over_the_sphere():
     normals = np.random.default_rng(0).standard_normal((200_000, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     assert np.abs(harmonics(normals).mean(axis=0)).max() < 0.01
+
+
+def worn(albedo: tuple[float, float, float], seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cloth of one colour under a lamp, brightness 1 in the mean, 8 bit; its normals and that lamp."""
+    rng = np.random.default_rng(seed)
+    normals = turning(6, 400, rng, 40)
+    lit = lamps(normals) / np.exp(np.log(lamps(normals)).mean(axis=(0, 1)))
+    colours = np.array(albedo) * rng.uniform(0.9, 1.1, (400, 1)) * lit + rng.normal(0, 1, lit.shape)
+    return np.clip(colours, 0, 255).astype(np.float32), normals, lit
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("unclipped", [0, 1, 100])
+def test_a_channel_that_clipped_nearly_everywhere_is_left_alone_and_the_others_are_not(unclipped: int, seed: int):
+    colours, normals, lit = worn((600, 120, 90), seed)
+    assert colours[..., 0].min() == 255
+    colours.reshape(-1, 3)[:unclipped, 0] = 240
+    light, gains = fit_light(colours, normals, normals, np.ones((6, 400), np.float32), area_m2=AREA_M2)
+    assert not light.terms[:, 0].any()
+    assert not gains[:, 0].any()
+    assert (light.at(normals.reshape(-1, 3))[:, 0] == 1).all()
+    away = np.log(light.at(normals.reshape(-1, 3)).reshape(lit.shape) / lit)[..., 1:]
+    assert (away.std(axis=(0, 1)) < 0.25 * np.log(lit).std(axis=(0, 1))[1:]).all()
+
+
+@pytest.mark.parametrize(("level", "weight"), [(255, 1), (120, 0)], ids=["overexposed", "nothing seen"])
+def test_where_nothing_tells_of_light_it_is_even(level: int, weight: int):
+    normals = turning(4, 100, np.random.default_rng(0), 40)
+    colours, weights = np.full((4, 100, 3), level, np.float32), np.full((4, 100), weight, np.float32)
+    light, gains = fit_light(colours, normals, normals, weights, area_m2=AREA_M2)
+    assert not light.terms.any()
+    assert not light.mean.any()
+    assert not gains.any()
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("red", [600, 300, 250])
+def test_what_clipped_in_one_channel_changes_the_brightness_of_no_other(red: float, seed: int):
+    """From everywhere to the half that faces the lamp: green and blue are as bright as if red were dark."""
+    colours, normals, lit = worn((red, 120, 90), seed)
+    colours[0, normals[0, :, 2].argmin(), 0] = 240  # one place that all channels show
+    assert 0 < (colours[..., 0] < 250).mean() < 0.7
+    light, _ = fit_light(colours, normals, normals, np.ones((6, 400), np.float32), area_m2=AREA_M2)
+    away = np.log(light.at(normals.reshape(-1, 3)).reshape(lit.shape) / lit)[..., 1:]
+    assert np.abs(away.mean(axis=(0, 1))).max() < 0.01
