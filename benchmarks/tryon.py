@@ -48,6 +48,7 @@ def run(*, quick: bool = False, seconds: float = 60.0, seed: int = 0, workers: i
             Metric(f"{name}_slowest_ms", trial.slowest_ms, "ms"),
             Metric(f"{name}_moving_depth_mm", trial.moving_depth_mm, "mm"),
             Metric(f"{name}_moving_inside_percent", trial.moving_inside_percent, "%"),
+            Metric(f"{name}_overlapping_percent", trial.overlapping_percent, "%"),
             Metric(f"{name}_resting_inside_percent", trial.resting_inside_percent, "%"),
             Metric(f"{name}_resting_depth_mm", trial.resting_depth_mm, "mm"),
             Metric(f"{name}_resting_ms", trial.resting_ms, "ms"),

@@ -9,7 +9,9 @@ worn.moving(...), worn.resting(...)                 # in the pose, out of the bo
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -17,12 +19,12 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
-from capture4d.app.tryon.push import LivePush
+from capture4d.app.tryon.push import LivePush, laid_on_skin
 from capture4d.body.limbs import WornBody
 from capture4d.body.skinning import PosedBody, ShapedBody, sparse_weights, with_pose
 from capture4d.body.surface_kernels import skin_sparse
 from capture4d.errors import InputError
-from capture4d.geometry.intersection_removal import Penetration
+from capture4d.geometry.intersection_removal import NOISE_M, Penetration
 from capture4d.types import Body, Garment, PoseSequence
 from retarget.animation.animator import Animator
 from retarget.animation.bodies import captured_person, retargeted_mean
@@ -305,18 +307,37 @@ class Fitting:
         """The garment and the body's surface in the next pose of a motion, metres."""
         body = with_pose(self.worn.person, rotations, translation)
         skinned = skin_sparse(body.corrected(), *self._body_skin, body.transforms)
-        unposed = np.ascontiguousarray(self.worn.unposed(body, translation), np.float64)
+        with _one_thread():
+            unposed = np.ascontiguousarray(self.worn.unposed(body, translation), np.float64)
         return self._push(skin_sparse(unposed, *self._cloth_skin, body.transforms), skinned), skinned
 
     def resting(self, poses: PoseSequence) -> tuple[Float64[np.ndarray, "verts 3"], Float64[np.ndarray, "skin 3"]]:
-        """The same as `animate` has it in the last of some poses."""
+        """The same as `animate` has it in the last of some poses; what it leaves inside is laid on the skin."""
         shaped = replace(poses, shape=np.asarray(self.worn.person.shape, np.float32))
         skinned = with_pose(self.worn.person, poses.rotations[-1], poses.translations[-1]).vertices()
-        return self.worn.resting(shaped).astype(np.float64), skinned
+        with _one_thread():
+            vertices = self.worn.resting(shaped)
+        return laid_on_skin(vertices.astype(np.float64), self._body.posed(skinned), NOISE_M), skinned
 
     def inside(self, vertices: Float[np.ndarray, "verts 3"], skinned: Float[np.ndarray, "skin 3"]) -> Penetration:
         """How much of it is inside the body, measured as `animate` does."""
         return Penetration.of(self._body.posed(skinned).contacts(np.asarray(vertices, np.float64)))
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Of torch, if it is loaded at all. For one window of an LSTM more threads bring nothing, and on a busy machine
+    they wait for each other, awake: 48 ms where one takes 2."""
+    torch = sys.modules.get("torch")
+    if torch is None:
+        yield
+        return
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 @functools.lru_cache(maxsize=1)

@@ -10,10 +10,10 @@ from jaxtyping import Float, Float64, Int32
 from scipy.sparse import csr_array
 
 from capture4d.body.limbs import WornBody
-from capture4d.geometry.intersection_removal import NOISE_M, Contacts
+from capture4d.geometry.intersection_removal import NOISE_M, Contacts, Surroundings
 from capture4d.geometry.mesh import vertex_adjacency
 
-__all__ = ["LivePush"]
+__all__ = ["LivePush", "laid_on_skin"]
 
 SPREADS = (0.5, 0.25, 0.1, 0.0)
 """Share of the way to its neighbours' mean displacement that each vertex goes, step by step. Without it the cloth is
@@ -21,6 +21,31 @@ dented, and in a crease a vertex is sent from one side into the other; with the 
 back in (docs/notebook/tryon.md)."""
 LEFT_M = 0.0008
 """No step more where nothing is deeper than this."""
+LAID_M = 0.0003
+"""How far over the skin a vertex is laid that no push has taken out."""
+LAYINGS = 4
+"""Searches for such vertices, at most."""
+
+
+def laid_on_skin(
+    points: Float64[np.ndarray, "verts 3"], body: Surroundings, deeper_m: float
+) -> Float64[np.ndarray, "verts 3"]:
+    """Vertices that are deeper than so much laid on the skin nearest to them, all others left as they are.
+
+    Where an arm runs into the trunk there are creases narrower than cloth is pushed out: a vertex that leaves one side
+    is inside the other. Both limbs carry it, so neither is told to be in its way.
+    """
+    best, least = points, np.full(len(points), np.inf)
+    for _ in range(LAYINGS):
+        found = body.contacts(points)
+        better = found.depths < least
+        best, least = np.where(better[:, None], points, best), np.minimum(found.depths, least)
+        deep = least > deeper_m
+        if not deep.any():
+            break
+        laid = found.feet + np.minimum(LAID_M, found.room / 2)[:, None] * found.normals
+        points = np.where(deep[:, None], laid, best)
+    return best
 
 
 class LivePush:
@@ -55,6 +80,8 @@ class LivePush:
             displaced = self._held(result, found) - start
             displaced += spread * (self._mean @ displaced - displaced)
             result = self._held(start + displaced, found)
+        else:
+            result = laid_on_skin(result, body, LEFT_M)
         return result
 
     def _held(self, points: np.ndarray, found: Contacts) -> np.ndarray:

@@ -2,12 +2,14 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
+import torch
 
 from capture4d.app.tryon.garments import Fitting, TriedGarment, open_garment
-from capture4d.app.tryon.push import LivePush
+from capture4d.app.tryon.push import LivePush, laid_on_skin
 from capture4d.app.tryon.session import Session, still
 from capture4d.app.tryon.trial import random_motion, try_out
 from capture4d.body.limbs import WornBody
@@ -15,7 +17,7 @@ from capture4d.body.skinning import pose_frame, with_pose
 from capture4d.captures.work_folder import load_registration
 from capture4d.errors import InputError
 from capture4d.files.records import save_poses
-from capture4d.geometry.intersection_removal import Penetration
+from capture4d.geometry.intersection_removal import Contacts, Penetration
 from retarget.animation.garment_model import load_garment_model
 from retarget.regression.controls import control_vectors
 from tests.unit.retarget.conftest import some_motion
@@ -47,6 +49,72 @@ def test_a_push_takes_out_what_is_in(tried: TriedGarment):
     assert after.depth_max_mm < 2
     untouched = fitting.worn.at_rest * (1.2, 1, 1.2)
     np.testing.assert_allclose(LivePush(worn, faces, len(deep), 0.003)(untouched, skin), untouched, atol=1e-9)
+
+
+class _Crease:
+    """Flesh on both sides of a gap of 1 mm about x = 0."""
+
+    def heights(self, points: np.ndarray, vertices: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+        return 0.0005 - np.abs(points[:, 0])
+
+    def contacts(self, points: np.ndarray) -> Contacts:
+        side = np.where(points[:, 0] < 0, -1.0, 1.0)
+        feet, normals = points * (0, 1, 1), np.zeros_like(points)
+        feet[:, 0], normals[:, 0] = 0.0005 * side, -side
+        free = np.full(len(points), np.inf), np.zeros(len(points), bool)
+        return Contacts(0.0005 - np.abs(points[:, 0]), normals, feet, normals, *free)
+
+
+class _Creased(WornBody):
+    def __init__(self) -> None:
+        """There is no person."""
+
+    def posed(self, vertices: np.ndarray) -> Any:
+        return _Crease()
+
+
+def test_cloth_in_a_crease_narrower_than_the_margin_is_laid_on_the_skin():
+    """Pushed out by 3 mm from one side it would be inside the other, to and fro."""
+    body, faces = _Crease(), np.array([[0, 1, 2]], np.int32)
+    inside = np.array([[-0.005, 0, 0], [-0.0051, 0.01, 0], [-0.0052, 0, 0.01]])
+    pushed = LivePush(_Creased(), faces, 3, 0.003)(inside, np.zeros((0, 3)))
+    assert body.contacts(pushed).depths.max() == 0
+    mixed = np.array([[0.0001, 0, 0], [0.004, 0.01, 0]])
+    laid = laid_on_skin(mixed, body, 1e-4)
+    np.testing.assert_array_equal(laid[0], mixed[0])
+    np.testing.assert_allclose(laid[1], (0.0002, 0.01, 0), atol=1e-9)
+
+
+def test_at_rest_what_the_exact_removal_leaves_inside_is_laid_on_the_skin(tried: TriedGarment):
+    fitting, weights = Fitting(tried, tried.first_shape, {}), tried.garment.skin_weights
+    assert weights is not None
+    poses = still(tried, Session(tried).sliders.rotations({}), np.zeros(3), fitting.worn.remembers + 1)
+    exact, skin = fitting.resting(poses)
+    found = WornBody(fitting.worn.person, fitting.worn.at_rest, weights).posed(skin).contacts(exact)
+    left = exact.astype(np.float32)
+    left[5] = found.feet[5] - 0.004 * found.normals[5]
+    worn: Any = fitting.worn
+    worn.resting = lambda _: left
+    assert fitting.inside(left, skin).depth_max_mm > 1
+    laid, _ = fitting.resting(poses)
+    assert fitting.inside(laid, skin).inside_percent == 0
+    others = np.arange(len(left)) != 5
+    np.testing.assert_array_equal(laid[others], left[others])
+
+
+def test_a_frame_takes_one_thread_of_torch_and_gives_the_others_back(tried: TriedGarment):
+    fitting, rotations = Fitting(tried, tried.first_shape, {}), Session(tried).sliders.rotations({})
+    worn, seen, before = cast("Any", fitting.worn), [], torch.get_num_threads()
+    unposed = worn.unposed
+    worn.unposed = lambda *pose: (seen.append(torch.get_num_threads()), unposed(*pose))[1]
+    torch.set_num_threads(3)
+    try:
+        fitting.moving(rotations, np.zeros(3))
+        after = torch.get_num_threads()
+    finally:
+        torch.set_num_threads(before)
+    assert seen == [1]
+    assert after == 3
 
 
 def test_a_live_frame_shows_the_body_as_it_is(tried: TriedGarment):
