@@ -98,8 +98,8 @@ def fit_light(
     found, gains = np.zeros((terms.shape[-1], 3)), np.zeros((frames, 3))
     if fits:
         found[:, told], gains[:, told] = _of_near_hue(fits, terms.shape[-1])
-    # The same places for all channels: what is printed there decides of no hue. Those that have clipped, too: they face
-    # the lamps, and without them the rest would be too bright.
+    # The same places for all channels: what is printed there decides of no hue. Those that have clipped, too: without
+    # them it would be the mean over the shade, and cloth would come out too dark.
     mean = np.einsum("tp,tpk->k", weights, terms) @ found / max(float(weights.sum()), 1e-12)
     return Light(found, mean), gains - gains.mean(axis=0)
 
