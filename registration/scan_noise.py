@@ -37,7 +37,8 @@ def roughness(vertices: Float[np.ndarray, "verts 3"], faces: Integer[np.ndarray,
     as the mesh.
 
     Each height over the mean of the neighbours is taken over the neighbours' own such heights, and so on, so that what
-    is curved, or folded, as slowly as the mesh can show counts next to nothing. Vertices on open edges are left out. 0 where there are no others.
+    is curved, or folded, as slowly as the mesh can show counts next to nothing. Vertices on open edges are left out.
+    0 where there are no others.
     """
     positions, triangles = np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int32)
     rim, used = open_vertices(triangles, len(positions))
