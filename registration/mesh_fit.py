@@ -119,7 +119,9 @@ class _Attempts:
         self.garment, self.garment_scan, self.config, self.rim_points = garment, scan, config, rim_points
         self.kept = analyse_template(garment, config.registration)
         self.scan = prepare_frame(self.kept, scan, config.registration)
-        self.rim = None if rim_points is None else PaintRim.of(self.kept, rim_points, self.scan.border_points)
+        self.rim: PaintRim | None = None
+        if rim_points is not None and config.settle.rim > 0.0:
+            self.rim = PaintRim.of(self.kept, rim_points, self.scan.border_points)
         self.made: list[_Attempt] = []
         self.fault: InputError | None = None
 
