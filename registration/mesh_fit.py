@@ -119,7 +119,9 @@ class _Attempts:
         self.garment, self.garment_scan, self.config, self.rim_points = garment, scan, config, rim_points
         self.kept = analyse_template(garment, config.registration)
         self.scan = prepare_frame(self.kept, scan, config.registration)
-        self.rim = None if rim_points is None else PaintRim.of(self.kept, rim_points, self.scan.border_points)
+        self.rim: PaintRim | None = None
+        if rim_points is not None and config.settle.rim > 0.0:
+            self.rim = PaintRim.of(self.kept, rim_points, self.scan.border_points)
         self.made: list[_Attempt] = []
         self.fault: InputError | None = None
 
@@ -257,8 +259,9 @@ def _keeping_lengths(tried: _Attempts, start: np.ndarray, landmarks: Landmarks |
     def placed(there: np.ndarray, *, turning: bool) -> np.ndarray:
         settled = _settled(tried, there, turning=turning)
         if float(scan.surface.grid.query(settled)[0].mean()) <= SETTLED:
-            last = _dense_alone(own if tried.rim is None else _borders_alone(own))
-            return register_frame(analysis, scan, settled, config=held_against_noise(last, *tried.roughness)).vertices
+            last = held_against_noise(_dense_alone(own), *tried.roughness)
+            seen = scan if tried.rim is None else tried.rim.others(scan, settled)  # the rim has drawn its borders there
+            return register_frame(analysis, seen, settled, config=last).vertices
         for schedule in (STIFF, LOOSE) if turning else (LOOSE,):
             dense = replace(own, dense=replace(own.dense, cold=schedule))
             there = register_frame(analysis, scan, there, config=_dense_alone(dense)).vertices
@@ -390,11 +393,6 @@ def _dense_alone(config: RegistrationConfig) -> RegistrationConfig:
     """Where the template lies on the scan already, nodes only push it about."""
     cold = replace(config.coarse.cold, steps=0)
     return replace(config, coarse=replace(config.coarse, cold=cold))
-
-
-def _borders_alone(config: RegistrationConfig) -> RegistrationConfig:
-    """Borders stay where the rim of their paint has drawn them."""
-    return replace(config, dense=replace(config.dense, cold=replace(config.dense.cold, boundary=(0.0, 0.0))))
 
 
 def _misfit(analysis: TemplateAnalysis, scan: FrameScan, vertices: np.ndarray) -> float:

@@ -20,7 +20,7 @@ from jaxtyping import Float32, Float64
 from scipy.spatial import KDTree
 
 from capture4d.captures.scan_files import whole_surface
-from capture4d.colours.spaces import parse_colour
+from capture4d.colours.spaces import format_colour, parse_colour
 from capture4d.errors import InputError
 from capture4d.files.atomic import nan_to_none, read_json, write_json
 from capture4d.files.outputs import new_files, require_apart
@@ -135,10 +135,20 @@ def run(
 
 
 def _told(result: MeshRegistration) -> tuple[str, ...]:
-    """What was left out of the scan."""
+    """What was left out of the scan, or not found in it."""
     if result.floor_percent == 0.0:
+        return result.notes
+    floor = f"a floor or wall, {result.floor_percent:.0f} % of the scan, is left out; the template has none"
+    return (floor, *result.notes)
+
+
+def _unfound(config: MeshRegistrationConfig, border_points: int) -> tuple[str, ...]:
+    """That paint which is there shows no border."""
+    if not config.border_colour or border_points:
         return ()
-    return (f"a floor or wall, {result.floor_percent:.0f} % of the scan, is left out; the template has none",)
+    paint = format_colour(parse_colour(config.border_colour))
+    reason = f"no border is found by its paint {paint}: the cloth has that colour too, or no open edge has it"
+    return (f"{reason}; registered without painted borders",)
 
 
 def _earlier(outputs: Sequence[Path], template: str, scan: str, overwrite: bool) -> Mapping[str, Any]:
@@ -224,6 +234,7 @@ def register_mesh(
         way=fitted.way,
         estimated=surface.estimated,
         floor_percent=floor_percent,
+        notes=_unfound(config, len(garment_scan.boundary_points)),
     )
 
 

@@ -85,7 +85,7 @@ def settle(
     Args:
         vertices: where it lies, metres.
         registration: how scan points are matched, and the solver.
-        rim: where the borders' paint begins, in place of the points on the borders themselves.
+        rim: where the borders' paint begins, in place of the points on those borders that it holds.
     """
     shape, rows = TurnedShape.of(analysis), analysis.laplacian_rows
     border_rows = Rows.of_points(analysis.border.vertices)
@@ -94,12 +94,14 @@ def settle(
     for step in range(config.steps):
         at = (step, config.steps)
         gate = anneal(config.gate, *at)
+        drawn, others = rim.terms(scan, vertices, config.rim) if rim else ([], scan)
         terms: list[Term] = [
             data_term(analysis, analysis.vertex_rows, scan.surface, vertices, every, gate, registration),
-            *(rim.terms(vertices, config.rim) if rim else border_terms(
-                analysis, border_rows, scan, vertices, anneal(config.boundary, *at), registration.boundary.gate,
+            *drawn,
+            *border_terms(
+                analysis, border_rows, others, vertices, anneal(config.boundary, *at), registration.boundary.gate,
                 rule=registration.boundary.dense_rule, along_curve=registration.boundary.along_curve,
-            )),
+            ),
             stretch_term(
                 vertices, analysis.edges, analysis.rest_lengths, weight=anneal(config.stretch, *at), compression=1.0
             ),

@@ -162,3 +162,20 @@ def test_a_scan_of_another_size_is_measured_once_and_not_searched_for_with_wider
 
 def unpainted(scan: GarmentScan) -> GarmentScan:
     return replace(scan, boundary_points=scan.boundary_points[:0], boundary_loops=scan.boundary_loops[:0])
+
+
+@pytest.mark.parametrize("weight", [0.1, 0.0])
+def test_a_rim_without_weight_leaves_borders_to_their_points(weight: float, garment, scan_of, monkeypatch) -> None:
+    seen, settle = [], mesh_fit.settle
+
+    def spy(*given, rim):
+        seen.append(rim)
+        return settle(*given, rim=rim)
+
+    monkeypatch.setattr(mesh_fit, "settle", spy)
+    scan = replace(scan_of(lambda points: points), boundary_loops=np.full(320, -1, np.int32))
+    rim = scan.boundary_points + np.float32(0.015) * np.sign(0.25 - scan.boundary_points[:, 1:2]) * np.eye(3)[1]
+    config = MeshRegistrationConfig(settle=SettleConfig(steps=1, rim=weight))
+    mesh_fit.fit_mesh(garment, scan, garment.template.vertices.astype(np.float64), config, rim_points=rim)
+    assert all((each is None) == (weight == 0.0) for each in seen)
+    assert seen

@@ -103,6 +103,22 @@ def test_paint_may_be_in_a_texture(garment, scan_of, quick, tmp_path: Path) -> N
     assert noted == (f"{tmp_path / 'scan.obj'}: no material 'b' in scan.mtl",)
 
 
+def test_cloth_of_the_colour_of_the_paint_has_no_borders_and_says_so(garment, scan_of, quick, tmp_path: Path) -> None:
+    scan = scan_of(swell).mesh
+    colours = np.tile(np.array([PAINT], np.uint8), (len(scan.vertices), 1))
+    painted = replace(quick, border_colour="ffd200", units="m")
+    result = register_mesh(garment.template, scan, colours=colours, find_border=painted_border, config=painted)
+    bare = register_mesh(garment.template, scan, config=replace(quick, units="m"))
+    np.testing.assert_array_equal(result.vertices, bare.vertices)
+    assert bare.notes == ()
+    (note,) = result.notes
+    assert note.startswith("no border is found by its paint #ffd200")
+    write_mesh(tmp_path / "template.ply", garment.template)
+    write_mesh(tmp_path / "scan.ply", scan, colours=colours)
+    files = tmp_path / "template.ply", tmp_path / "scan.ply", tmp_path / "out.ply"
+    assert run(*files, painted, find_border=painted_border).notes == (f"{files[1]}: {note}",)
+
+
 def test_alignment_comes_first_when_asked_for(garment, scan_of, quick) -> None:
     scan = scan_of(swell).mesh
     away = scan.with_vertices((scan.vertices + np.array([2.0, 0, 0])).astype(np.float32))
