@@ -1,4 +1,7 @@
-"""Takes of printed cloth: simulated once for each person, scanned once for each print, kept in the cache folder."""
+"""Takes of printed and of plain cloth: simulated once for each person, scanned once for each print and each noise.
+
+All is kept in the cache folder.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,7 @@ from data_synth.scanner.config import FusionConfig, RigConfig, ScannerConfig, Sh
 from data_synth.scanner.scan import LABEL_BODY, scan_surfaces
 from data_synth.take import TakePlan, plan_take, take_rig, take_surfaces
 
-__all__ = ["LAMP", "PrintedTake", "printed_take", "subjects"]
+__all__ = ["LAMP", "PrintedTake", "plain_scans", "printed_take", "subjects"]
 
 LAMP = ShadingConfig(lighting="overhead", pixel_noise=0.04)
 """One strong lamp that flickers, and noise of which a scan's vertices keep about 0.02."""
@@ -77,13 +80,32 @@ def subjects(frames: int, *, quick: bool) -> list[SynthConfig]:
     return [first, second]
 
 
-def printed_take(config: SynthConfig, name: PrintName, print_mm: float | None, *, workers: int) -> PrintedTake:
+def plain_scans(config: SynthConfig, noise: int, *, workers: int) -> Path:
+    """A capture of plain cloth: a simulated take, scanned in the usual light; goes on where it was stopped.
+
+    Args:
+        config: of a take without scans.
+        noise: which of the scanner's noises.
+    """
+    simulated = read_capture(cached_take(config, workers=workers), scans=False)
+    folder = user_cache_folder() / "printed" / f"{simulated.path.name}-plain-{noise}"
+    lit = replace(config, scanner=replace(config.scanner, shading=ShadingConfig()))
+    with one_maker(folder):
+        _make(folder, lit, simulated, workers, noise=noise)
+    return folder
+
+
+def printed_take(
+    config: SynthConfig, name: PrintName, print_mm: float | None, *, frames: int | None = None, workers: int
+) -> PrintedTake:
     """Scans of a simulated take in which something is printed on the cloth; goes on where it was stopped.
 
     Args:
         config: of a take without scans.
+        frames: from the beginning; None is all of the take.
     """
     simulated = read_capture(cached_take(config, workers=workers), scans=False)
+    simulated = replace(simulated, frame_ids=simulated.frame_ids[:frames])
     plan = plan_take(replace(config, print=name, print_mm=print_mm))
     assert plan.paint.print is not None
     picture = picture_over(plan.paint.print, plan.fine, plan.template.uv)
@@ -91,21 +113,24 @@ def printed_take(config: SynthConfig, name: PrintName, print_mm: float | None, *
     digest = hashlib.sha256(drawn).hexdigest()[:8]
     folder = user_cache_folder() / "printed" / f"{simulated.path.name}-{name}-{digest}"
     with one_maker(folder):
-        _make(folder, replace(config, print=name, print_mm=print_mm), simulated, drawn, workers)
+        folder.mkdir(parents=True, exist_ok=True)
+        write_bytes(folder / "print.png", drawn)
+        _make(folder, replace(config, print=name, print_mm=print_mm), simulated, workers)
     return PrintedTake(folder, folder / "print.png", folder / "labels", logo_circle(plan.template, print_mm))
 
 
-def _make(folder: Path, config: SynthConfig, simulated: Capture, drawn: bytes, workers: int) -> None:
+def _make(folder: Path, config: SynthConfig, simulated: Capture, workers: int, *, noise: int = 0) -> None:
     for place in (folder / "scans", folder / "labels"):
         place.mkdir(parents=True, exist_ok=True)
     for entry in ("body.npz", "poses.npz", "template.npz", "truth"):
         if not (folder / entry).exists():
             (folder / entry).symlink_to(simulated.path / entry)
-    write_bytes(folder / "print.png", drawn)
-    capture = replace(simulated, path=folder, garment_colour=None, files=None)
+    printed = config.print is not None
+    colour = None if printed else simulated.garment_colour
+    capture = replace(simulated, path=folder, garment_colour=colour, files=None)
     missing = [each for each in simulated.frame_ids if not (folder / "scans" / f"{each:06d}.ply").is_file()]
-    prepare = partial(_Scanned.open, config, simulated, folder)
-    for _ in run_jobs(_scan, missing, prepare=prepare, workers=workers, label=f"scan {config.print}"):
+    prepare = partial(_Scanned.open, config, simulated, folder, noise)
+    for _ in run_jobs(_scan, missing, prepare=prepare, workers=workers, label=f"scan {config.print or 'plain cloth'}"):
         pass
     write_capture_description(capture)
 
@@ -118,14 +143,15 @@ class _Scanned:
     simulated: Capture
     rig: Rig
     folder: Path
+    noise: int
 
     @staticmethod
-    def open(config: SynthConfig, simulated: Capture, folder: Path) -> _Scanned:
+    def open(config: SynthConfig, simulated: Capture, folder: Path, noise: int) -> _Scanned:
         extent = []
         for frame_id in simulated.frame_ids:
             fine = read_truth_vertices(simulated, frame_id)
             extent.append((fine.min(axis=0), fine.max(axis=0)))
-        return _Scanned(plan_take(config), simulated, take_rig(config, np.array(extent)), folder)
+        return _Scanned(plan_take(config), simulated, take_rig(config, np.array(extent)), folder, noise)
 
 
 def _scan(scene: _Scanned, frame_id: int) -> None:
@@ -136,7 +162,7 @@ def _scan(scene: _Scanned, frame_id: int) -> None:
         scene.rig,
         take_surfaces(plan, read_truth_vertices(simulated, frame_id), body),
         config=plan.config.scanner,
-        rng=np.random.default_rng([plan.config.seed, 200, frame_id]),
+        rng=np.random.default_rng([plan.config.seed, 200 + scene.noise, frame_id]),
         frame_id=frame_id,
         time_s=simulated.time_s(frame_id),
     )

@@ -1,9 +1,10 @@
 """Registration against the truth, and against what else one can install.
 
 Kinds of data: `synth`, a synthetic take of a T-shirt on a moving body (made once, kept in the user's cache);
-`diffcloth`, a shirt simulated by somebody else, scanned by our scanner; `faces`, six faces in dense correspondence and
-one real scan; `printed`, takes of printed cloth (`printed_registration`);
-and pairs of meshes for `register-mesh`: `people`, `borders`, `hopeless` (`benchmarks.mesh_pairs`).
+`takes`, several such takes, frame by frame (`whole_takes`); `diffcloth`, a shirt simulated by somebody else, scanned by
+our scanner; `faces`, six faces in dense correspondence and one real scan; `printed`, takes of printed cloth
+(`printed_registration`); and pairs of meshes for `register-mesh`: `people`, `borders`, `hopeless`
+(`benchmarks.mesh_pairs`).
 `diffcloth` and `faces` are read from the folder `shared/data` beside the project.
 
 Limits this was built against, on a take of 212 frames that ends in the pose it began with, with a template of 5,000
@@ -35,6 +36,7 @@ from benchmarks.metric import Metric
 from benchmarks.peers import PEERS, run_peer
 from benchmarks.printed_registration import printed_metrics
 from benchmarks.whole_frame import whole_frame_metrics
+from benchmarks.whole_takes import take_metrics
 from capture4d.captures.capture import Capture, read_capture, write_capture_description
 from capture4d.captures.evaluation import (
     border_errors,
@@ -100,7 +102,7 @@ class Scores:
 def run(
     *,
     quick: bool = False,
-    data: Literal["synth", "diffcloth", "faces", "printed", "people", "borders", "hopeless"] = "synth",
+    data: Literal["synth", "takes", "diffcloth", "faces", "printed", "people", "borders", "hopeless"] = "synth",
     frames: int = 212,
     compared: int = 6,
     workers: int = 2,
@@ -112,7 +114,7 @@ def run(
     Args:
         quick: few frames of a small take; the same keys.
         data: see above.
-        frames: of the take (synth, printed); drift compares its last 20 with its first 20.
+        frames: of the take (synth, takes, printed); drift compares its last 20 with its first 20.
         compared: frames on which all methods start from the same place.
         workers: processes that make the take; registration itself is measured in one.
         capture: capture folder with truth to measure on instead of the cached synthetic take.
@@ -126,6 +128,8 @@ def run(
         return _faces(2 if quick else len(FACES))
     if data == "printed":
         return printed_metrics(quick=quick, frames=frames, workers=workers)
+    if data == "takes":
+        return take_metrics(quick=quick, frames=frames, workers=workers)
     with tempfile.TemporaryDirectory(prefix="capture4d-registration-") as scratch:
         if data == "diffcloth":
             scans = _scanned_diffcloth(Path(scratch) / "capture", 4 if quick else 13, workers)
