@@ -68,7 +68,7 @@ class _Take:
     """Vertices more than `FAR_MM` off."""
     cut_faces: np.ndarray
     unfitted: np.ndarray
-    """Vertices with a residual that lie more than `UNFITTED_MM` from the scan."""
+    """Vertices whose residual is at most `UNFITTED_MM`, though they lie farther from the scan."""
     up: np.ndarray
     """See `HANGING`."""
     verdicts: np.ndarray
@@ -154,7 +154,7 @@ def _frame(
         vertices, residual = arrays["vertices"], arrays["residual_m"]
     error = 1e3 * correspondence_errors(vertices, places)
     scan = load_garment_scan(work / "garment" / "frames" / f"{frame_id:06d}.npz", frame_id).mesh
-    fitted = np.isfinite(residual)
+    fitted = residual <= 1e-3 * UNFITTED_MM  # NaN is not
     away = 1e3 * surface_distances(scan, vertices[fitted].astype(np.float64))
     return (
         float(error.mean()),

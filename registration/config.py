@@ -191,9 +191,10 @@ class DenseConfig:
 class SequenceConfig:
     """How a take is cut up and where each frame starts."""
 
-    segment: Count = 120
-    """Frames of a segment. Segments are registered side by side, on as many processes and machines as there are, and
-    joined."""
+    segment: Count = 240
+    """Frames of a segment, more or less a quarter: it is begun where the pose is nearest to that of the template, for
+    it knows nothing of how the cloth has slid before. Segments are registered side by side, on as many processes and
+    machines as there are, and joined."""
     overlap: Whole = 24
     """Frames before its first one from which a segment is registered, starting from the skinned template. In the last
     two thirds of them the segment before fades into it."""

@@ -43,7 +43,7 @@ REGION_MEASURES = (
 )
 """What is told of each region: as in the whole frame; and shares of its faces that cut others."""
 
-COVERED_SPACINGS = 2.5
+COVERED_SPACINGS = 2.0
 """A vertex has scan data if a scan point lies within this many scan spacings of it, measured along the surface."""
 
 FAR_MM = 2.0

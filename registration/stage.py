@@ -47,7 +47,7 @@ from capture4d.runs.stage import StageResult
 from capture4d.types import Body, Garment, PoseSequence
 from registration.chain import Chain
 from registration.config import RegistrationConfig
-from registration.predictions import Mover
+from registration.predictions import Mover, bent_away
 from registration.print_stage import made_print, print_inputs, settings_with_print
 from registration.prints import load_print
 from registration.take import Take, register_take
@@ -201,7 +201,12 @@ def _chain(
             body = "" if made is None else made.digest
         body = digest_of([body, moving[1].shape])
         poses = [_array_digest(moving[1].rotations[row], moving[1].translations[row]) for row in range(len(frame_ids))]
-        pieces = cut(len(frame_ids), sequence.segment, 0 if sequence.start == "skinned" else sequence.overlap)
+        pieces = cut(
+            len(frame_ids),
+            sequence.segment,
+            0 if sequence.start == "skinned" else sequence.overlap,
+            unease=bent_away(garment.skin_weights, *moving),
+        )
     read = asdict(config)
     for apart in ("segment", "overlap", "seam_mm"):  # what they decide shows in where frames start from
         del read["sequence"][apart]

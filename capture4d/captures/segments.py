@@ -5,13 +5,17 @@ as many processes and machines as there are. A segment is followed from some fra
 start that needs no frame before, and has found its way by the time it begins. Those frames are the earlier segment's,
 too: there the two are compared, and joined.
 
-Where a take is cut depends on how many frames it has, and on nothing else.
+Where a take is cut depends on its frames alone: on how many there are and, where it is told, on how easily one can
+begin in each; never on who does the work.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Float
 
 __all__ = ["Segment", "cut"]
 
@@ -30,16 +34,24 @@ class Segment:
     """Position behind its last frame."""
 
 
-def cut(frames: int, length: int, overlap: int) -> tuple[Segment, ...]:
-    """Cut a take into segments of `length` frames; the last one has half of that to one and a half.
+def cut(
+    frames: int, length: int, overlap: int, *, unease: Float[np.ndarray, " frames"] | None = None
+) -> tuple[Segment, ...]:
+    """Cut a take into segments of about `length` frames; all but the last one have half of that to one and a half.
 
     Args:
         frames: of the take.
         overlap: frames before its first one from which a segment is followed; at most half of `length`.
+        unease: of each frame, how unsafe it is to begin there. Segments are then followed from the easiest frame within
+            a quarter of the length of where they would be otherwise, the nearest of equal ones; None: from there.
     """
     count = max(1, (frames + length // 2) // length)
+    ahead, reach = min(overlap, length // 2), length // 4
     starts = [length * index for index in range(count)]
-    ahead = min(overlap, length // 2)
+    if unease is not None:
+        away = np.arange(-reach, reach + 1)
+        away = away[np.argsort(np.abs(away), kind="stable")]
+        starts[1:] = [int(start + away[np.argmin(unease[start - ahead + away])]) for start in starts[1:]]
     return tuple(
         Segment(index, start - ahead if index else start, start, stop)
         for index, (start, stop) in enumerate(pairwise([*starts, frames]))

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from capture4d.body.skinning import pose_frame, skin
 from capture4d.errors import InputError
 from capture4d.types import Body, Garment, Mesh, PoseSequence
-from registration.predictions import Mover, blend, choose, misfit, predict
+from registration.predictions import Mover, bent_away, blend, choose, misfit, predict
 from registration.register import prepare_frame
 from registration.sequence import register_run
 from registration.template import analyse_template
@@ -88,6 +88,16 @@ def test_carrying_within_one_pose_changes_nothing(bound, body, poses, config) ->
 def test_joints_must_agree(bound, body, poses, config) -> None:
     with pytest.raises(InputError, match="expected the body's 2 joints"):
         Mover.create(analyse_template(bound, config), body, replace(poses, joint_names=("root", "other")))
+
+
+def test_a_pose_is_as_far_as_its_bent_joints_and_the_cloth_they_carry(body, poses) -> None:
+    turned = np.zeros((FRAMES, 2, 3))
+    turned[1, 0] = turned[2, 1] = (0.0, 0.0, 0.5)
+    turned[3, 1] = (0.0, 1.0, 0.0)
+    rotations = Rotation.from_rotvec(turned.reshape(-1, 3)).as_matrix().reshape(FRAMES, 2, 3, 3)
+    weights = np.array([[0, 1], [1, 0], [1, 0], [1, 0]], np.float32)
+    away = bent_away(weights, body, replace(poses, rotations=rotations.astype(np.float32)))
+    assert away == pytest.approx([0.0, 0.0, 0.25, 0.5, 0.0, 0.0], abs=1e-3)
 
 
 def test_frames_follow_the_scan_and_start_from_the_best(bound, body, poses, config, load) -> None:
