@@ -61,16 +61,10 @@ def subjects(frames: int, *, quick: bool) -> list[SynthConfig]:
         return [
             replace(PRESETS["tiny"], name="printed-tiny", frames=frames, capture_every=3, scans=False, scanner=scanner)
         ]
-    first = replace(
-        PRESETS["tshirt-200k"],
-        name="printed",
-        frames=frames,
-        scans=False,
-        scanner=replace(PRESETS["tshirt-200k"].scanner, shading=LAMP),
-    )
+    first = replace(PRESETS["tshirt-200k"], frames=frames, scans=False)
     second = replace(
         first,
-        name="printed-cotton",
+        name="tshirt-cotton-reach",
         seed=3,
         fabric="shirt-cotton",
         body_shape=(0.5, 1.2),
@@ -89,9 +83,8 @@ def plain_scans(config: SynthConfig, noise: int, *, workers: int) -> Path:
     """
     simulated = read_capture(cached_take(config, workers=workers), scans=False)
     folder = user_cache_folder() / "printed" / f"{simulated.path.name}-plain-{noise}"
-    lit = replace(config, scanner=replace(config.scanner, shading=ShadingConfig()))
     with one_maker(folder):
-        _make(folder, lit, simulated, workers, noise=noise)
+        _make(folder, config, simulated, workers, noise=noise)
     return folder
 
 
@@ -106,7 +99,8 @@ def printed_take(
     """
     simulated = read_capture(cached_take(config, workers=workers), scans=False)
     simulated = replace(simulated, frame_ids=simulated.frame_ids[:frames])
-    plan = plan_take(replace(config, print=name, print_mm=print_mm))
+    lit = replace(config, scanner=replace(config.scanner, shading=LAMP), print=name, print_mm=print_mm)
+    plan = plan_take(lit)
     assert plan.paint.print is not None
     picture = picture_over(plan.paint.print, plan.fine, plan.template.uv)
     drawn = cv2.imencode(".png", picture[..., ::-1])[1].tobytes()
@@ -115,7 +109,7 @@ def printed_take(
     with one_maker(folder):
         folder.mkdir(parents=True, exist_ok=True)
         write_bytes(folder / "print.png", drawn)
-        _make(folder, replace(config, print=name, print_mm=print_mm), simulated, workers)
+        _make(folder, lit, simulated, workers)
     return PrintedTake(folder, folder / "print.png", folder / "labels", logo_circle(plan.template, print_mm))
 
 

@@ -49,7 +49,7 @@ from registration.stage import run as register
 
 __all__ = ["take_metrics"]
 
-MORE_NOISES = ((1, 2), ())
+MORE_NOISES = ((0, 1), ())
 """With which each simulated take is scanned once more, in plain cloth."""
 HANGING, RAISED = -0.9, 0.0
 """How steeply the higher upper arm points up, 1 overhead and 0 level: below and above."""
