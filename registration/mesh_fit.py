@@ -8,7 +8,8 @@ In this order, until the scan is reached:
                middle at first
 
 From there the template settles with its own shape and lengths (`settle`), limbs that turned about themselves on a way
-from afar are turned back (`untwisted`), and a vertex by vertex stage follows.
+from afar are turned back (`untwisted`), and a vertex by vertex stage follows. What has open borders is tried as cloth
+besides, with lengths alone (`slid`).
 
 Where `align` may, and a rigid motion brings the template far nearer, these are tried from there as well; from there
 alone if nothing of the scan lies near the start. Then:
@@ -38,8 +39,9 @@ from registration.border_strip import PaintRim
 from registration.config import ApproachConfig, MeshRegistrationConfig, RegistrationConfig, Schedule
 from registration.correspondences import mesh_normals
 from registration.geodesic_signature import Likeness, geodesic_signatures, likeness
+from registration.held_lengths import keeps_lengths, slid
 from registration.limb_twist import untwisted
-from registration.mesh_verdict import is_tight, reaches
+from registration.mesh_verdict import BORDER_MM, CLOTH_BORDER_MM, is_tight, reaches
 from registration.quality import assess
 from registration.register import FrameScan, prepare_frame, register_frame
 from registration.scan_noise import held_against_noise, roughness
@@ -108,6 +110,8 @@ class _Attempt:
     fit: MeshFit
     misfit: float
     reached: bool
+    is_cloth: bool = False
+    """It has reached a bare scan with its lengths: what is nearer without them overlaps where the scan has holes."""
 
 
 class _Attempts:
@@ -171,11 +175,20 @@ class _Attempts:
         except InputError as error:
             self.fault = self.fault or error
             return False
-        quality = assess(self.kept, scan, vertices, self.config.registration.quality)
-        fit = MeshFit(vertices, start, self.kept, scan, way)
-        reached = reaches(self.kept, scan, vertices, self.config.scan_fit) and is_tight(quality)
-        self.made.append(_Attempt(fit, _misfit(self.kept, scan, vertices), reached))
+        fit, is_cloth = MeshFit(vertices, start, self.kept, scan, way), self.is_cloth(vertices, scan)
+        reached = is_cloth or self.reaches(vertices, scan, BORDER_MM)
+        self.made.append(_Attempt(fit, _misfit(self.kept, scan, vertices), reached, is_cloth))
         return reached
+
+    def reaches(self, vertices: np.ndarray, scan: FrameScan, border_mm: float) -> bool:
+        """Whether the template hugs all of the scan, and ends where the scan does."""
+        tight = is_tight(assess(self.kept, scan, vertices, self.config.registration.quality))
+        return tight and reaches(self.kept, scan, vertices, self.config.scan_fit, border_mm)
+
+    def is_cloth(self, vertices: np.ndarray, scan: FrameScan) -> bool:
+        """Whether a template with open borders does so with its lengths, on a scan without paint."""
+        bare = len(self.kept.border.vertices) > 0 and not len(scan.border_points)
+        return bare and keeps_lengths(self.kept, vertices) and self.reaches(vertices, scan, CLOTH_BORDER_MM)
 
     @property
     def reached(self) -> bool:
@@ -208,7 +221,11 @@ class _Attempts:
 
     @property
     def best(self) -> _Attempt:
-        return min(self.made, key=lambda attempt: attempt.misfit)
+        return min(self.made, key=_rank)
+
+
+def _rank(attempt: _Attempt) -> tuple[bool, float]:
+    return not attempt.is_cloth, attempt.misfit
 
 
 def fit_mesh(
@@ -245,7 +262,7 @@ def fit_mesh(
     kept = [attempt for attempt in tried.made if attempt.fit.way not in FREE]
     if not kept:
         return tried.best.fit
-    closest = min(kept, key=lambda attempt: attempt.misfit)
+    closest = min(kept, key=_rank)
     better = {"sized": closest.misfit, "soft": BETTER * closest.misfit}  # that the size is another is known already
     freer = [attempt for attempt in tried.made if attempt.fit.way in FREE and attempt.misfit < better[attempt.fit.way]]
     return min(freer or [closest], key=lambda attempt: attempt.misfit).fit
@@ -255,17 +272,20 @@ def _keeping_lengths(tried: _Attempts, start: np.ndarray, landmarks: Landmarks |
     """Near, far and wide, until one reaches the scan; and the start, which a rigid motion may have brought there."""
     config, analysis, scan = tried.config, tried.kept, tried.scan
     own = config.registration
+    bare = landmarks is None and not len(scan.border_points)  # painted borders are found from farther
 
     def placed(there: np.ndarray, *, turning: bool) -> np.ndarray:
         settled = _settled(tried, there, turning=turning)
         if float(scan.surface.grid.query(settled)[0].mean()) <= SETTLED:
             last = held_against_noise(_dense_alone(own), *tried.roughness)
             seen = scan if tried.rim is None else tried.rim.others(scan, settled)  # the rim has drawn its borders there
-            return register_frame(analysis, seen, settled, config=last).vertices
+            shaped = register_frame(analysis, seen, settled, config=last).vertices
+            return _nearer_as_cloth(tried, shaped, there) if bare else shaped
+        shaped = there
         for schedule in (STIFF, LOOSE) if turning else (LOOSE,):
             dense = replace(own, dense=replace(own.dense, cold=schedule))
-            there = register_frame(analysis, scan, there, config=_dense_alone(dense)).vertices
-        return there
+            shaped = register_frame(analysis, scan, shaped, config=_dense_alone(dense)).vertices
+        return _nearer_as_cloth(tried, shaped, there)
 
     def carried(begin: np.ndarray) -> np.ndarray:
         there = register_frame(analysis, scan, begin, config=_coarse_alone(own)).vertices
@@ -290,7 +310,6 @@ def _keeping_lengths(tried: _Attempts, start: np.ndarray, landmarks: Landmarks |
     movable = config.align == "auto" and landmarks is None
     if config.lengths == "free":
         return _moved_there(start, scan) if movable else start
-    bare = landmarks is None and not len(scan.border_points)  # painted borders are found from farther
     swinging = bare and _limbs_are_away(start, scan)
     if swinging and far(start):
         return start
@@ -313,6 +332,19 @@ def _keeping_lengths(tried: _Attempts, start: np.ndarray, landmarks: Landmarks |
         tried.add("wide", begin, lambda: drawn(begin, config.approach.wide, None))
         return begin
     return moved
+
+
+def _nearer_as_cloth(tried: _Attempts, shaped: np.ndarray, there: np.ndarray) -> np.ndarray:
+    """The template as it was shaped; or slid from where it came with its lengths, if it reaches the scan so, or lies
+    nearer to it."""
+    analysis, scan = tried.kept, tried.scan
+    if not len(analysis.border.vertices):
+        return shaped
+    cloth = slid(analysis, scan, there, _dense_alone(tried.config.registration), tried.roughness)
+    if tried.is_cloth(cloth, scan):
+        return cloth
+    nearer = keeps_lengths(analysis, cloth) and _misfit(analysis, scan, cloth) < _misfit(analysis, scan, shaped)
+    return cloth if nearer else shaped
 
 
 def _settled(tried: _Attempts, there: np.ndarray, *, turning: bool) -> np.ndarray:

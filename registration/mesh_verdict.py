@@ -11,10 +11,13 @@ from registration.quality import FrameQuality, scan_distances
 from registration.register import FrameScan
 from registration.template import TemplateAnalysis
 
-__all__ = ["is_tight", "judge", "reaches"]
+__all__ = ["BORDER_MM", "CLOTH_BORDER_MM", "is_tight", "judge", "reaches"]
 
 BORDER_MM = 5.0
 """Mean distance of the template's open borders from the scan above which it does not end where the scan does."""
+CLOTH_BORDER_MM = 15.0
+"""The same for cloth that has its lengths: where they leave a border, the scan lacks some of it (8 to 11 mm of a shirt
+in its true place, carried off, whose scan has holes)."""
 FACETS = 0.05
 """Share of an edge by which a face may cut off what is round: a coarse template has not failed for it."""
 TIGHT_MM, TIGHT_STRETCH = 0.8, 1.6
@@ -27,12 +30,18 @@ def is_tight(quality: FrameQuality) -> bool:
     return numbers["fit_mean_mm"] <= TIGHT_MM and numbers["stretch_p99"] <= TIGHT_STRETCH
 
 
-def reaches(analysis: TemplateAnalysis, scan: FrameScan, vertices: np.ndarray, config: ScanFitConfig) -> bool:
-    """Whether the template lies on all of the scan, beyond its borders as well, and ends where the scan does."""
+def reaches(
+    analysis: TemplateAnalysis, scan: FrameScan, vertices: np.ndarray, config: ScanFitConfig, border_mm: float
+) -> bool:
+    """Whether the template lies on all of the scan, beyond its borders as well, and ends where the scan does.
+
+    Args:
+        border_mm: mean distance of the template's open borders from the scan, up to which it does.
+    """
     away = 1e3 * scan_distances(analysis, scan, vertices)[0]
     border = vertices[analysis.border.vertices]
     hanging = 1e3 * float(scan.surface.grid.query(border)[0].mean()) if len(border) else 0.0
-    ends = hanging <= BORDER_MM + 1e3 * scan.surface.spacing
+    ends = hanging <= border_mm + 1e3 * scan.surface.spacing
     return bool(ends and away.mean() <= config.check_mm and np.percentile(away, 95) <= config.far_check_mm)
 
 
