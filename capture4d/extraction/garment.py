@@ -52,14 +52,14 @@ FAR_SIDE = 0.6
 
 
 EROSION = 0.9
-"""Sample spacings by which fused scans stop short of an open border, in the median: 0.98 on plain cloth, 0.64 to 0.86 on
-printed, whose paint looks half a millimetre wider (`benchmarks.printed_takes`, scans of 2.7 mm)."""
+"""Sample spacings by which fused scans stop short of an open border, in the median: 0.98 on plain cloth, 0.64 to 0.86
+on printed, whose paint looks half a millimetre wider (`benchmarks.printed_takes`, scans of 2.7 mm)."""
 
 
 LOST, LOST_SPREADS = 1.6, 1.45
-"""What scans of bare cloth lose of the band's width in the median, instead of `EROSION`: so many sample spacings. Neither
-is more than so many times the differences of width (20 to 90 %), for a scan that ends cleanly loses nothing. One point
-has lost 1 to 2.3 spacings; with what it has kept, that makes the same width to within 1.5 mm
+"""What scans of bare cloth lose of the band's width in the median, instead of `EROSION`: so many sample spacings.
+Neither is more than so many times the differences of width (20 to 90 %), for a scan that ends cleanly loses nothing.
+One point has lost 1 to 2.3 spacings; with what it has kept, that makes the same width to within 1.5 mm
 (`benchmarks.painted_shirts`)."""
 
 
