@@ -1,8 +1,9 @@
 """What is printed on a template: learned from the first frames of a take, or read from a picture over its UVs.
 
-Learned: frames of the first second are registered without colour, the scans' colours there are averaged, the frames are
-registered to that average, and averaged again, twice. What each of them was off by alone is taken out by that; what all
-were off by stays, for nothing but the print itself knows better.
+Learned: frames of the first second in which the body stands nearly as in the first are registered without colour, the
+scans' colours there are averaged, the frames are registered to that average, and averaged again, twice. What each of
+them was off by alone is taken out by that; what all were off by stays, for nothing but the print itself knows better.
+Where the body moves away, cloth slides, and how far nothing tells.
 
 Cloth is printed if its colours differ by more than folds under a lamp can make them: what the logarithms of the
 colours differ by from their mean over a hand's breadth is fitted by the normals, which tell the light, and the rest is
@@ -25,6 +26,7 @@ from capture4d.files.atomic import write_npz
 from capture4d.geometry.point_grid import PointGrid
 from capture4d.types import GarmentScan
 from capture4d.value_checks import require_array, require_finite
+from registration.alignment import fit_similarity
 from registration.cloth_colours import ClothColours, ColourSamples, log_colours, sample_faces, see_colours
 from registration.colour_term import without_light
 from registration.config import RegistrationConfig, Schedule
@@ -33,7 +35,15 @@ from registration.register import FrameScan, prepare_frame, register_frame
 from registration.sequence import register_run
 from registration.template import TemplateAnalysis
 
-__all__ = ["learn_print", "learning_positions", "load_print", "print_contrast", "print_of_picture", "save_print"]
+__all__ = [
+    "learn_print",
+    "learning_positions",
+    "load_print",
+    "print_contrast",
+    "print_of_picture",
+    "save_print",
+    "still_positions",
+]
 
 LEVELS = ((0.014, 0.022), (0.007, 0.0065))
 """Distance between samples, and reach of the blur, metres: wide, then narrow. A print with features of 10 mm is found
@@ -53,6 +63,9 @@ CONTRAST = 0.35
 LEARNED_FPS, LEARNED_FRAMES, AVERAGED, ROUNDS = 20.0, 19, 4, 2
 """Frames that are registered before the print is known, so many a second; how many of them, evenly spread, it is
 learned from; and how often they are registered to it."""
+STILL_M, FEWEST_FRAMES = 0.02, 3
+"""Mean way of the skinned template from the first frame, but for turns and shifts as a whole, up to which a frame is
+learned from; and how many are whatever the pose. Chosen on person 1 of `benchmarks.printed_takes`."""
 HELD = Schedule(2, (0.012, 0.012), smooth=(0.2, 0.2), stretch=(2.0, 2.0), boundary=(0.1, 0.1))
 """Dense steps of these."""
 
@@ -79,9 +92,11 @@ def learn_print(
         load: the garment scan of a frame.
     """
     found: list[tuple[FrameScan, np.ndarray]] = []
+    positions = positions if mover is None else still_positions(mover.skinned, positions)
+    adrift = replace(config, sequence=replace(config.sequence, relax=0.0))
     samples, contrast, reaches = _samples(analysis), float("nan"), tuple(reach for _, reach in LEVELS)
     for result in register_run(
-        analysis, mover, positions, frame_ids, load=load, done=lambda position, before: None, config=config
+        analysis, mover, positions, frame_ids, load=load, done=lambda position, before: None, config=adrift
     ):
         if result.quality.verdict == "failed":
             continue
@@ -97,6 +112,7 @@ def learn_print(
                 break
     if not contrast >= CONTRAST:
         return (), contrast
+    found = found[1:] or found  # the first one, from afar, is off by more than those that start from it
     chosen = np.unique(np.linspace(0, len(found) - 1, min(AVERAGED, len(found))).round().astype(int))
     frames = [found[row] for row in chosen]
     cloth = _average(analysis, samples, frames, None, reaches)
@@ -110,6 +126,21 @@ def learn_print(
         ]
         cloth = _average(analysis, samples, frames, cloth, reaches)
     return _where_printed(analysis, cloth), contrast
+
+
+def still_positions(skinned: Callable[[int], Float64[np.ndarray, "verts 3"]], positions: Sequence[int]) -> list[int]:
+    """Those of ascending positions at which the body stands nearly as at the first.
+
+    Args:
+        skinned: the template in the pose at a position.
+    """
+    first, found = skinned(positions[0]), []
+    for count, position in enumerate(positions):
+        there = skinned(position)
+        moved = np.linalg.norm(fit_similarity(there, first, with_scale=False).apply(there) - first, axis=1)
+        if count < FEWEST_FRAMES or moved.mean() < STILL_M:
+            found.append(position)
+    return found
 
 
 def _coloured_frame(analysis: TemplateAnalysis, scan: GarmentScan, config: RegistrationConfig) -> FrameScan:

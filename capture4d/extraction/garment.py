@@ -52,13 +52,19 @@ FAR_SIDE = 0.6
 
 
 EROSION = 0.9
-"""Sample spacings by which fused scans stop short of an open border (measured against the synthetic scanner)."""
+"""Sample spacings by which fused scans stop short of an open border, in the median: 0.98 on plain cloth, 0.64 to 0.86
+on printed, whose paint looks half a millimetre wider (`benchmarks.printed_takes`, scans of 2.7 mm)."""
 
 
 LOST, LOST_SPREADS = 1.6, 1.45
-"""What scans of bare cloth lose of the band's width in the median: so many sample spacings, but not more than so many
-times the differences of width (20 to 90 %), for a scan that ends cleanly loses nothing. One point has lost 1 to 2.3
-spacings; with what it has kept, that makes the same width to within 1.5 mm (`benchmarks.painted_shirts`)."""
+"""What scans of bare cloth lose of the band's width in the median, instead of `EROSION`: so many sample spacings.
+Neither is more than so many times the differences of width (20 to 90 %), for a scan that ends cleanly loses nothing.
+One point has lost 1 to 2.3 spacings; with what it has kept, that makes the same width to within 1.5 mm
+(`benchmarks.painted_shirts`)."""
+
+
+BARE_SHARE = 0.95
+"""Of a scan's vertices; where more are garment, there is no body."""
 
 
 CONNECTED = 0.2
@@ -227,8 +233,10 @@ def _border_points(
             narrow, middle, full = np.percentile(straight[own], (20, 50, 90))
             missing = np.full(len(own), EROSION * spacing)
             if full - narrow < EVEN_BAND * spacing:
-                lost = min(LOST * spacing, LOST_SPREADS * (full - narrow))
-                width = max(full + 0.2 * spacing, middle + lost)
+                bare = whole is None or len(labels) > BARE_SHARE * len(whole.labels)
+                width = middle + min((LOST if bare else EROSION) * spacing, LOST_SPREADS * (full - narrow))
+                if bare:
+                    width = max(width, full + 0.2 * spacing)
                 missing = np.clip(width - straight[own], 0.0, 2.5 * spacing)
             found = outer[own] + (missing / straight[own])[:, None] * across[own]
         points.append(straighten(found, STRAIGHTENED * spacing).astype(np.float32))

@@ -16,6 +16,7 @@ from registration.prints import (
     load_print,
     print_of_picture,
     save_print,
+    still_positions,
 )
 from registration.register import prepare_frame, register_frame
 from registration.template import TemplateAnalysis, analyse_template
@@ -179,3 +180,27 @@ def test_a_print_is_learned_from_the_first_second_whatever_the_rate() -> None:
     assert learning_positions(1000, 60) == range(0, 55, 3)
     assert learning_positions(1000, 20) == range(0, 19, 1)
     assert learning_positions(5, 60) == range(0, 5, 3)
+
+
+def test_a_print_is_learned_where_the_body_stands_as_in_the_first_frame(template) -> None:
+    turn = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+
+    def skinned(position: int) -> np.ndarray:
+        bent = template.rest + np.array([0.0, 0.0, 0.003 * position]) * (template.rest[:, 1:2] > HEIGHT / 2)
+        return bent @ turn.T + 0.1 * position
+
+    kept = still_positions(skinned, range(0, 60, 3))
+    assert kept == [*range(0, len(kept) * 3, 3)]
+    assert 3 < len(kept) < 20
+    assert still_positions(lambda position: (1 + position) * template.rest, range(10)) == [0, 1, 2]
+
+
+def test_the_first_frame_from_afar_is_not_learned_from_where_others_follow(template, config) -> None:
+    def load(frame_id: int) -> GarmentScan:
+        return replace(scan_of(blobs if frame_id > 1 else stripes), frame_id=frame_id)
+
+    later, _ = learn_print(template, None, [0, 1, 2], [1, 2, 3], load=load, config=config)
+    alone, _ = learn_print(template, None, [0], [2], load=load, config=config)
+    inked = later[-1].known & alone[-1].known
+    difference = (later[-1].values - alone[-1].values)[inked]
+    assert np.abs(difference - difference.mean(axis=0)).mean() < 0.2 * alone[-1].values[inked].std()

@@ -11,6 +11,8 @@ from tests.shapes import tube_faces
 
 CLOTH, TOP, BOTTOM, SUIT = (47, 98, 201), (255, 196, 0), (229, 51, 42), (150, 152, 156)
 AROUND, ALONG, BAND = 200, 120, 0.012
+SPACING = 0.003
+"""Of the samples of a ragged sheet, metres."""
 
 
 def painted_tube(rng: np.random.Generator, *, holes: int = 0, bottom: tuple[int, int, int] = BOTTOM) -> Scan:
@@ -56,28 +58,51 @@ def test_border_points_lie_on_the_border(holes: int) -> None:
     assert np.percentile(np.abs(height[bottom]), 95) < 0.006
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_what_a_ragged_scan_lost_of_the_paint_is_given_back(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    spacing = 0.003
-    height, along = np.arange(50) * spacing, np.arange(120) * spacing
+def ragged_sheet(rng: np.random.Generator, lost: tuple[float, float]) -> tuple[Mesh, np.ndarray, float]:
+    """A sheet that ends raggedly before its painted border, its colours, and where the border truly is.
+
+    Args:
+        lost: from least to most, in sample spacings, beside what is lost between samples.
+    """
+    height, along = np.arange(50) * SPACING, np.arange(120) * SPACING
     grid = np.stack(np.meshgrid(along, height, indexing="ij"), axis=2).reshape(-1, 2)
-    grid += rng.uniform(-0.2, 0.2, grid.shape) * spacing
+    grid += rng.uniform(-0.2, 0.2, grid.shape) * SPACING
     border = grid[:, 1].max()
     corner = (np.arange(119)[:, None] * 50 + np.arange(49)).reshape(-1)
     faces = np.concatenate([corner[:, None] + [0, 50, 51], corner[:, None] + [0, 51, 1]]).astype(np.int32)
-    lost = np.repeat(rng.uniform(0.2, 1.6, 120), 50) * spacing
-    faces = faces[(grid[:, 1] < border - lost)[faces].all(axis=1)]
+    ends = border - np.repeat(rng.uniform(*lost, 120), 50) * SPACING
+    faces = faces[(grid[:, 1] < ends)[faces].all(axis=1)]
     used, renumbered = np.unique(faces, return_inverse=True)
-    vertices = np.column_stack([grid, np.zeros(len(grid))])[used]
+    vertices = np.column_stack([grid, np.zeros(len(grid))])[used].astype(np.float32)
     colours = np.where(vertices[:, 1:2] > border - 0.015, TOP, CLOTH).astype(np.uint8)
-    mesh = Mesh(vertices.astype(np.float32), renumbered.reshape(-1, 3).astype(np.int32))
-    found, _ = painted_border(mesh, colours, TOP)
-    inside = found[(found[:, 0] > 0.03) & (found[:, 0] < along[-1] - 0.03)]
-    ends = [vertices[np.abs(vertices[:, 0] - x) < spacing / 2, 1].max() for x in along]
-    assert border - np.mean(ends) > spacing
-    assert len(inside) > 60
-    assert abs(inside[:, 1].mean() - border) < 0.5 * spacing
+    return Mesh(vertices, renumbered.reshape(-1, 3).astype(np.int32)), colours, border
+
+
+def inner_heights(found: np.ndarray) -> np.ndarray:
+    """Of border points that are not at the sides of the sheet."""
+    return found[(found[:, 0] > 0.03) & (found[:, 0] < 119 * SPACING - 0.03), 1]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_a_ragged_scan_lost_of_the_paint_is_given_back(seed: int) -> None:
+    mesh, colours, border = ragged_sheet(np.random.default_rng(seed), (0.2, 1.6))
+    columns = np.rint(mesh.vertices[:, 0] / SPACING).astype(int)
+    ends = [mesh.vertices[columns == column, 1].max() for column in range(120)]
+    assert border - np.mean(ends) > SPACING
+    found = inner_heights(painted_border(mesh, colours, TOP)[0])
+    assert len(found) > 60
+    assert abs(found.mean() - border) < 0.5 * SPACING
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_scans_of_the_body_as_well_have_lost_less(seed: int) -> None:
+    mesh, colours, border = ragged_sheet(np.random.default_rng(seed), (0.0, 0.8))
+    body = mesh.vertices + np.array([0, 0, -0.05], np.float32)
+    both = Mesh(np.concatenate([mesh.vertices, body]), np.concatenate([mesh.faces, mesh.faces + len(body)]))
+    scan = Scan(both, np.concatenate([colours, np.full_like(colours, SUIT)]), 1, 0.0)
+    found = inner_heights(extract_garment(scan, CLOTH, {"top": TOP}).boundary_points)
+    assert len(found) > 60
+    assert abs(found.mean() - border) < 0.2 * SPACING
 
 
 def test_one_paint_cannot_tell_loops_apart() -> None:
