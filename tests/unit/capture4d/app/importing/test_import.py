@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from capture4d.app.export.stage import possible_formats
 from capture4d.captures.capture import Capture, write_capture_description, write_scan
 from capture4d.captures.truth import TruthFrame, TruthModel, write_truth_frame, write_truth_model
 from capture4d.captures.work_folder import open_work
@@ -145,6 +146,27 @@ def test_the_score_is_how_far_the_sequence_was_moved(
     for path in (moved / "truth").iterdir():
         path.unlink()
     assert "expected the truth of a synthetic take in truth/, found none" in fails(capsys, "score", back, moved)
+
+
+@pytest.mark.parametrize(
+    "name", ["garment.usdc", "garment.abc", "garment.glb", "garment.pc2", "garment.mdd", "obj", "ply"]
+)
+def test_every_format_comes_back_with_the_score_that_went_out(name: str, moved: Path, tmp_path: Path):
+    kind = {"usdc": "usd"}.get(name.rpartition(".")[2], name.rpartition(".")[2])
+    if not possible_formats([kind])[0]:
+        pytest.skip(f"{kind}: its package is not installed")
+    work = tmp_path / "work"
+    template = work / "registration" / "garment.npz"
+    out = ["--format", kind, "--glb.motion", "exact", "--output", tmp_path / "out", "--quiet"]
+    assert run("export", work, *out) == GOOD
+    back = tmp_path / "back"
+    given = ["--template", template, "--output", back, "--fps", 50, "--quiet"]
+    assert run("import", tmp_path / "out" / name, *given) == GOOD
+    for each in (work, back):
+        assert run("score", each, moved, "--workers", 1, "--quiet") == GOOD
+    before, after = figures(work), figures(back)
+    assert before.keys() >= {"correspondence_mean_mm", "truth_distance_mean_mm", "truth_hidden_mean_mm"}
+    assert after == pytest.approx(before, abs=1e-3)
 
 
 def test_a_sequence_has_the_same_score_whoever_says_what_was_scanned(
