@@ -64,6 +64,7 @@ from capture4d.files.records import (
 from capture4d.files.tensors import read_tensors, write_tensors
 from capture4d.mesh_files.animated.moving_mesh import MovingMesh
 from capture4d.mesh_files.animated.point_caches import write_mdd, write_pc2
+from capture4d.mesh_files.gltf.animated_scene import AnimatedScene, SceneTargets, write_animated_glb
 from capture4d.mesh_files.meshes import read_coloured_mesh, read_mesh, write_mesh
 from capture4d.motions.bvh import Bvh, format_bvh, moved_by_root
 from capture4d.motions.motion_files import read_motion, write_amass, write_bvh
@@ -269,6 +270,14 @@ def _moving(path: Path) -> list[np.ndarray]:
     return list(read_sequence(path, MESH, ImportConfig(fps=50.0)).frames())
 
 
+def _moving_glb(path: Path) -> None:
+    """One target, seen whole in the second frame."""
+    shape, times = MESH.vertices, np.array([0, 0.02], np.float32)
+    weights, clock = np.array([[0], [1]], np.float32), {"fps": 50.0, "first_frame": 3}
+    targets = SceneTargets(shape, 0 * shape + np.float32([0, 0, 1]), 0.1 * shape[None], 0 * shape[None], weights, ["a"])
+    write_animated_glb(path, AnimatedScene(MESH, times, targets, scene_extras=clock))
+
+
 KINDS = [
     Kind("mesh.obj", lambda path: write_mesh(path, MESH, polygon_sizes=_POLYGONS), read_coloured_mesh),
     Kind("coloured.obj", lambda path: write_mesh(path, MESH, colours=_COLOURS), read_coloured_mesh),
@@ -283,6 +292,7 @@ KINDS = [
       for ending, kind in (("png", "png"), ("jpg", "jpeg"), ("tif", "tiff"), ("bmp", "bmp"), ("webp", "webp"),
                            ("tga", "tga"))),
     Kind("cache.pc2", lambda path: write_pc2(path, MOVING), _moving),
+    Kind("moving.glb", _moving_glb, _moving),
     Kind("cache.mdd", lambda path: write_mdd(path, MOVING), _moving),
     Kind("body.npz", lambda path: save_body(path, BODY), load_body),
     Kind("garment.npz", lambda path: save_garment(path, GARMENT), load_garment),

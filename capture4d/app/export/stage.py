@@ -39,11 +39,12 @@ from capture4d.runs.frame_lists import listed
 from capture4d.runs.progress import progress
 from capture4d.runs.stage import Stage, StageResult, open_stage
 
-__all__ = ["Exported", "default_format", "possible_formats", "run"]
+__all__ = ["SCRIPT", "Exported", "default_format", "possible_formats", "run"]
 
 SCHEMA = 1
 _PACKAGES = {"usd": USD, "abc": ALEMBIC}
 _RECORD = "export.json"
+SCRIPT = "open_in_blender.py"
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,4 +206,4 @@ def _write_script(stage: Stage, clip: Clip, record: dict[str, Any]) -> None:
     }
     text = files("capture4d.app.export").joinpath("open_in_blender.txt").read_text(encoding="utf-8")
     said = json.dumps(take).replace("null", "None")
-    write_bytes(stage.path / "open_in_blender.py", text.replace("TAKE = {}", f"TAKE = {said}", 1).encode())
+    write_bytes(stage.path / SCRIPT, text.replace("TAKE = {}", f"TAKE = {said}", 1).encode())

@@ -15,7 +15,7 @@ class ImportConfig:
     """What a sequence of meshes does not say of itself."""
 
     fps: Positive | None = None
-    """Frames a second; needed where the files do not tell: USD and Alembic do."""
+    """Frames a second; needed where the files do not tell: USD, Alembic and our GLB do."""
     units: Literal[Units, "auto"] = "auto"
     """Of the meshes; `auto`: what a USD file says, metres of all others."""
     up: Literal["y", "z", "auto"] = "auto"

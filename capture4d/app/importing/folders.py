@@ -23,7 +23,7 @@ def import_meshes(
     """Bring a sequence that another tool registered or edited into a work folder: WORK/registration.
 
     Args:
-        meshes: a folder with a mesh file a frame, or a USD, Alembic, PC2 or MDD file.
+        meshes: a folder with a mesh file a frame, or a USD, Alembic, GLB, PC2 or MDD file.
         template: the mesh that moves, a template.npz or a mesh file, in the same order of vertices.
     """
     from capture4d.app.importing.stage import run as stage

@@ -1,4 +1,5 @@
-"""A sequence of meshes, whatever holds it: a folder with a mesh file a frame, USD, Alembic, a point cache."""
+"""A sequence of meshes, whatever holds it: a folder with a mesh file a frame, USD, Alembic, GLB, a point
+cache."""
 
 from __future__ import annotations
 
@@ -13,6 +14,7 @@ from capture4d.app.importing.config import ImportConfig
 from capture4d.captures.scan_files import list_scans
 from capture4d.errors import InputError
 from capture4d.mesh_files.animated.alembic import read_alembic
+from capture4d.mesh_files.animated.glb import read_glb
 from capture4d.mesh_files.animated.moving_mesh import MovingMesh
 from capture4d.mesh_files.animated.point_caches import read_mdd, read_pc2
 from capture4d.mesh_files.animated.usd import read_usd
@@ -73,6 +75,8 @@ def _opened(path: Path, template: Mesh, config: ImportConfig) -> MovingMesh:
             return read_usd(path)
         case ".abc":
             return read_alembic(path, config.fps)
+        case ".glb" | ".gltf":
+            return read_glb(path, config.fps)
         case ".pc2":
             return read_pc2(path, template)
         case ".mdd":
@@ -82,7 +86,7 @@ def _opened(path: Path, template: Mesh, config: ImportConfig) -> MovingMesh:
                 )
             return read_mdd(path, template, config.fps)
         case suffix:
-            kinds = "a folder of mesh files, or .usd, .usda, .usdc, .usdz, .abc, .pc2, .mdd"
+            kinds = "a folder of mesh files, or .usd, .usda, .usdc, .usdz, .abc, .glb, .gltf, .pc2, .mdd"
             raise InputError(f"expected {kinds}, found '{suffix}'", where=path)
 
 

@@ -136,13 +136,23 @@ def region_rows(records: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, flo
 
 
 def truth_measures(
-    registered: RegisteredSequence, row: int, model: TruthModel, truth_vertices: np.ndarray
+    registered: RegisteredSequence,
+    row: int,
+    model: TruthModel,
+    truth_vertices: np.ndarray,
+    *,
+    covered: np.ndarray | None = None,
 ) -> dict[str, float]:
-    """The measures against truth of one frame, millimetres."""
+    """The measures against truth of one frame, millimetres.
+
+    Args:
+        covered: (V,) bool, vertices that the scan shows; those that were registered to it if absent.
+    """
     garment = registered.garment
     vertices = np.asarray(registered.vertices[row])
     mesh, truth = garment.template.with_vertices(vertices), model.fine.with_vertices(truth_vertices)
-    covered = np.isfinite(registered.residual_m[row])
+    if covered is None:
+        covered = np.isfinite(registered.residual_m[row])
     away, back = truth_distances(mesh, truth)
     there, hidden = away[covered], away[~covered]
     places = material_points(truth_vertices, truth.faces, model.template_faces, model.template_barycentric)

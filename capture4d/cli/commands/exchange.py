@@ -76,7 +76,7 @@ class Export(_Alone):
 
     def __call__(self) -> int:
         from capture4d import pipeline
-        from capture4d.app.export.stage import default_format, possible_formats
+        from capture4d.app.export.stage import SCRIPT, default_format, possible_formats
 
         if self.all and self.format:
             raise CommandLineError("--all: expected to be without --format, found both")
@@ -99,6 +99,8 @@ class Export(_Alone):
         for line in broken:
             print(f"capture4d: {line}", file=sys.stderr)
         print(f"exports: {done.result.path}")
+        if (script := done.result.path / SCRIPT).is_file():
+            print(f"for Blender: blender -P {script}")
         return BAD_RESULT if broken else GOOD
 
 
@@ -146,7 +148,8 @@ class Import(_Alone, MeshOptions):
     """Bring in a sequence that another tool registered or edited: USD, Alembic, a point cache, a mesh file a frame."""
 
     meshes: Annotated[Positional[Path], arg(metavar="MESHES")]
-    """Folder with a mesh file a frame, its number in its name; or a .usd, .usda, .usdc, .abc, .pc2 or .mdd file."""
+    """Folder with a mesh file a frame, its number in its name; or a .usd, .usda, .usdc, .abc, .glb, .pc2 or .mdd
+    file."""
     template: Path
     """The mesh that moves, in the same order of vertices: template.npz or garment.npz, or a mesh file."""
     output: Path
@@ -181,7 +184,8 @@ class Score(StageOptions):
         limits = parse_limits(self.fail_above)
         found = pipeline.score(self.work, self.capture, workers=self.workers)
         if found.without_scan:
-            print("capture4d: what was scanned is not known; every vertex counts as seen", file=sys.stderr)
+            said = f"the scans of {found.without_scan} frames cannot be read; every vertex counts as seen there"
+            print(f"capture4d: {self.capture}: {said}", file=sys.stderr)
         for key, value in found.metrics.items():
             print(f"{key:32s} {shown(value):>8s} {METRICS[key][0]}".rstrip())
         print(f"score: {found.frames} frames: {found.path}")

@@ -13,7 +13,7 @@ import pytest
 def script(tmp_path: Path) -> Path:
     text = files("capture4d.app.export").joinpath("open_in_blender.txt").read_text(encoding="utf-8")
     path = tmp_path / "open_in_blender.py"
-    path.write_text(text.replace("TAKE = {}", 'TAKE = {"files": ["garment.usdc"]}', 1), encoding="utf-8")
+    path.write_text(text.replace("TAKE = {}", 'TAKE = {"files": ["garment.usdc"], "first": 1}', 1), encoding="utf-8")
     return path
 
 
@@ -38,9 +38,15 @@ def test_blenders_own_command_line_names_no_file_of_the_export(script: Path, mon
     assert said(script, monkeypatch, str(script), "garment.glb", wheel=True) == nothing + "garment.glb"
 
 
+def test_what_is_saved_or_drawn_is_no_file_of_the_export(script: Path, monkeypatch: pytest.MonkeyPatch):
+    line = said(script, monkeypatch, str(script), "a.blend", "a.png", "--frame", "12", "garment.glb", wheel=True)
+    assert line == f"capture4d: none of these files is in {script.parent}: garment.glb"
+
+
+@pytest.mark.parametrize("option", ["--scans", "--frame"])
 @pytest.mark.parametrize(("given", "found"), [((), "nothing"), (("many",), "many"), (("-1",), "-1")])
-def test_scans_without_a_number_are_one_line(
-    given: tuple[str, ...], found: str, script: Path, monkeypatch: pytest.MonkeyPatch
+def test_an_option_without_a_number_is_one_line(
+    option: str, given: tuple[str, ...], found: str, script: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    line = said(script, monkeypatch, "blender", "-P", str(script), "--", "--scans", *given)
-    assert line == f"capture4d: --scans: expected a number, found {found}"
+    line = said(script, monkeypatch, "blender", "-P", str(script), "--", option, *given)
+    assert line == f"capture4d: {option}: expected a number, found {found}"
