@@ -56,7 +56,7 @@ from capture4d.types import GarmentScan
 
 __all__ = ["CLOUDS", "ExtractionSettings", "changes", "run"]
 
-SCHEMA = 5
+SCHEMA = 6
 NAME = "extract"
 CLOUDS = "clouds.json"
 """Names the frames whose scans are points alone, so that normals and faces are estimated; not there without any."""
