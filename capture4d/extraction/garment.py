@@ -52,15 +52,13 @@ FAR_SIDE = 0.6
 
 
 EROSION = 0.9
-"""Sample spacings by which fused scans stop short of an open border, in the median: 0.98 on plain cloth, 0.64 to 0.86
-on printed, whose paint looks half a millimetre wider (`benchmarks.printed_takes`, scans of 2.7 mm)."""
+"""Sample spacings by which fused scans stop short of an open border (measured against the synthetic scanner)."""
 
 
 LOST, LOST_SPREADS = 1.6, 1.45
-"""What scans of bare cloth lose of the band's width in the median, instead of `EROSION`: so many sample spacings.
-Neither is more than so many times the differences of width (20 to 90 %), for a scan that ends cleanly loses nothing.
-One point has lost 1 to 2.3 spacings; with what it has kept, that makes the same width to within 1.5 mm
-(`benchmarks.painted_shirts`)."""
+"""What scans of bare cloth lose of the band's width in the median: so many sample spacings, but not more than so many
+times the differences of width (20 to 90 %), for a scan that ends cleanly loses nothing. One point has lost 1 to 2.3
+spacings; with what it has kept, that makes the same width to within 1.5 mm (`benchmarks.painted_shirts`)."""
 
 
 BARE_SHARE = 0.95
@@ -69,6 +67,10 @@ BARE_SHARE = 0.95
 
 CONNECTED = 0.2
 """Share of a border's open vertices where the scan goes on, above which the border is found from the inner rim."""
+
+
+MIN_PIECE = 0.08
+"""Share of a paint's open vertices below which a piece of it is not asked how wide the paint is."""
 
 
 STRAIGHTENED = 3.0
@@ -230,18 +232,46 @@ def _border_points(
                 sharp = sharpen_labels(whole.scan.mesh, whole.scan.colours, whole.labels)
             found = border_beyond_rim(whole.scan.mesh, sharp == GARMENT, sharp == paint)
         else:
-            narrow, middle, full = np.percentile(straight[own], (20, 50, 90))
+            bare = whole is None or len(labels) > BARE_SHARE * len(whole.labels)
+            pieces = None if bare else _pieces(mesh, labels == paint, rim[own])
+            width = _width(straight[own], pieces, spacing)
             missing = np.full(len(own), EROSION * spacing)
-            if full - narrow < EVEN_BAND * spacing:
-                bare = whole is None or len(labels) > BARE_SHARE * len(whole.labels)
-                width = middle + min((LOST if bare else EROSION) * spacing, LOST_SPREADS * (full - narrow))
-                if bare:
-                    width = max(width, full + 0.2 * spacing)
+            if width is not None:
                 missing = np.clip(width - straight[own], 0.0, 2.5 * spacing)
             found = outer[own] + (missing / straight[own])[:, None] * across[own]
         points.append(straighten(found, STRAIGHTENED * spacing).astype(np.float32))
         labels_of.append(np.full(len(points[-1]), paint, labels.dtype))
     return np.concatenate(points), np.concatenate(labels_of)
+
+
+def _pieces(mesh: Mesh, painted: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+    """Which connected piece of the paint each of some painted vertices is on; -1 on none."""
+    part = face_components(mesh.faces, len(painted), painted[mesh.faces].all(axis=1))
+    piece_of = np.full(len(painted), -1)
+    piece_of[mesh.faces[part >= 0]] = part[part >= 0, None]
+    return piece_of[vertices]
+
+
+def _width(straight: np.ndarray, pieces: np.ndarray | None, spacing: float) -> float | None:
+    """How wide a paint is that a scan has lost the edge of, metres; None where no piece of it is of even width.
+
+    On a dressed person some of the border lies on the body, and that is scanned to its end. Bare cloth may lose
+    something all along.
+
+    Args:
+        straight: what is left of its width at the scan's open vertices.
+        pieces: the connected piece of paint of each, on a dressed person; None of bare cloth.
+    """
+    narrow, middle, full = np.percentile(straight, (20, 50, 90))
+    if pieces is None:
+        if full - narrow >= EVEN_BAND * spacing:
+            return None
+        return max(full + 0.2 * spacing, middle + min(LOST * spacing, LOST_SPREADS * (full - narrow)))
+    for piece in np.unique(pieces[pieces >= 0]):
+        own = straight[pieces == piece]
+        if len(own) >= MIN_PIECE * len(straight) and np.ptp(np.percentile(own, (20, 90))) < EVEN_BAND * spacing:
+            return float(full + 0.1 * spacing)
+    return None
 
 
 def _spacing(mesh: Mesh) -> float:

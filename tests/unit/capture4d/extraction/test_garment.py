@@ -105,6 +105,27 @@ def test_scans_of_the_body_as_well_have_lost_less(seed: int) -> None:
     assert abs(found.mean() - border) < 0.2 * SPACING
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_border_with_nothing_behind_it_is_as_widely_painted_as_one_that_is_scanned_to_its_end(seed: int) -> None:
+    rng, spacing, border = np.random.default_rng(seed), 0.0027, 0.17
+    across, up = np.meshgrid(np.arange(200) * spacing, np.arange(80) * spacing, indexing="ij")
+    grid = np.stack([across, up], axis=2).reshape(-1, 2) + rng.uniform(-0.2, 0.2, (200 * 80, 2)) * spacing
+    corner = (np.arange(199)[:, None] * 80 + np.arange(79)).reshape(-1)
+    faces = np.concatenate([corner[:, None] + [0, 80, 81], corner[:, None] + [0, 81, 1]]).astype(np.int32)
+    bare = grid[:, 0] > 0.25
+    cloth = (grid[:, 1] < border - np.where(bare, 0.0048, 0.0))[faces].all(axis=1)
+    suit = (grid[:, 1] > border + 0.01)[faces].all(axis=1)
+    colours = np.where(grid[:, 1:2] > border - 0.015, TOP, CLOTH)
+    colours = np.where(grid[:, 1:2] > border, SUIT, colours).astype(np.uint8)
+    vertices = np.column_stack([grid, np.zeros(len(grid))]).astype(np.float32)
+    scan = Scan(Mesh(vertices, faces[cloth | suit]), colours, 1, 0.0)
+    found = extract_garment(scan, CLOTH, {"top": TOP}).boundary_points
+    for here in (found[:, 0] < 0.2, found[:, 0] > 0.3):
+        inside = found[here & (found[:, 0] > 0.03) & (found[:, 0] < 0.5) & (found[:, 1] > 0.1)]
+        assert len(inside) > 60
+        assert abs(inside[:, 1].mean() - border) < 0.45 * spacing
+
+
 def test_one_paint_cannot_tell_loops_apart() -> None:
     found = extract_garment(painted_tube(np.random.default_rng(2), bottom=TOP), CLOTH, {"top": TOP, "bottom": TOP})
     assert found.loop_names == ("top", "bottom")
