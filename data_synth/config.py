@@ -233,6 +233,8 @@ class SynthConfig:
 def folded(config: SynthConfig) -> SynthConfig:
     """The same take in a garment that folds here and there: its sheet is coarser, for there are two meshes over it, and
     hangs more freely below the chest; a waistband keeps its hold."""
+    if config.folds is not None:
+        return config
     simulation, folds = config.simulation, FoldConfig()
     simulation = replace(simulation, vertices=simulation.vertices // 2, substeps=32, iterations=1, damping=0.993)
     if config.garment in (None, "shirt"):
