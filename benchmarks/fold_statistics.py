@@ -19,8 +19,10 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from capture4d.geometry.mesh import boundary_edges, vertex_normals
+from data_synth.cloth.panels import Pattern
+from data_synth.cloth.patterns import PanelMesh
 
-__all__ = ["FoldStatistics", "fold_statistics", "smoothed", "torso"]
+__all__ = ["FoldStatistics", "fold_statistics", "legs", "smoothed", "torso"]
 
 BAND_M = (0.02, 0.09)
 """Scales between which a fold counts, metres."""
@@ -30,6 +32,9 @@ COTANGENTS = (0.05, 8.0)
 """Limits: those of slivers are no weights."""
 TORSO_M, TORSO_HALF_WIDTH_M = (0.03, 0.42), 0.2
 """The trunk of a shirt: heights over its lowest point, and how far from its middle, metres."""
+
+LEGS_M = 0.03
+"""Thigh and shin of trousers: from so far over the hems to as far under the crotch, metres on the pattern."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +78,15 @@ def torso(vertices: np.ndarray) -> np.ndarray:
     over = vertices[:, 1] - vertices[:, 1].min()
     aside = np.abs(vertices[:, 0] - np.median(vertices[:, 0]))
     return (over > TORSO_M[0]) & (over < TORSO_M[1]) & (aside < TORSO_HALF_WIDTH_M)
+
+
+def legs(mesh: PanelMesh, pattern: Pattern) -> np.ndarray:
+    """Thigh and shin of trousers, (V,) bool, in any pose: where they lie on the pattern, as drafted."""
+    origins = np.array([panel.origin for panel in pattern.panels])
+    height = mesh.vertex_uv[:, 1] - origins[mesh.face_panels[mesh.vertex_faces], 1]
+    hems = np.concatenate([mesh.loops["leg_left"], mesh.loops["leg_right"]])
+    inseams = np.concatenate([mesh.seams["in_left"], mesh.seams["in_right"]])
+    return (height > height[hems].max() + LEGS_M) & (height < height[inseams].max() - LEGS_M)
 
 
 def smoothed(

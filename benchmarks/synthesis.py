@@ -10,6 +10,7 @@ and 4 deg of the truth.
 With folds here and there (`--data folds`), two bodies, two motions: ninth decile of the folds' turn at least 2.6 times
 the median, calm area 20 to 35 %, height 2.6 to 3.9 mm, in the mean of four poses and none of them below .85 of it;
 first percentile of the least stretch at least .97, at most 325 fine faces that cut others, residual at least 7 deg.
+Trousers (`--data trousers`) have the same limits on thigh and shin, at four moments of a walk and of a squat.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from typing import Literal
 import numpy as np
 from rich.console import Console
 
-from benchmarks.fold_statistics import fold_statistics, torso
+from benchmarks.fold_statistics import fold_statistics, legs, torso
 from benchmarks.metric import Metric
 from benchmarks.scan_errors import scan_errors
 from capture4d.geometry.mesh import vertex_normals
@@ -33,14 +34,19 @@ from capture4d.types import Mesh
 from data_synth.cloth.fabrics import FABRICS
 from data_synth.cloth.patterns import locate
 from data_synth.cloth.quality import measure_cloth, principal_stretches
-from data_synth.cloth.simulation import dress, simulate
+from data_synth.cloth.simulation import simulate
 from data_synth.cloth.wrinkle_relaxation import lift_levels, relax_levels
 from data_synth.config import OTHER_BODIES, PRESETS, MotionConfig, SynthConfig, folded
 from data_synth.scanner.scan import LABEL_BODY, scan_surfaces
 from data_synth.stage import run as synthesise
-from data_synth.take import TakePlan, plan_take, simulate_take, take_rig, take_surfaces
+from data_synth.take import TakePlan, in_view, plan_take, simulate_take, take_rig, take_surfaces
+from data_synth.worn import is_held_at_waist, put_on
+
+Cloth = Literal["even", "folds", "trousers"]
 
 POSES = ("rest", "hanging", "half", "overhead")
+MOMENTS = ("start", "third", "two_thirds", "end")
+"""Of a clip, at which trousers are looked at."""
 FOLD_UNITS = {"fold_p90_to_median": "", "calm_percent": "%", "fold_height_rms_mm": "mm", "compression_p1": ""}
 """Means over the poses, each of them, and the least of any take; compression is the first percentile of the least
 stretch of any face."""
@@ -57,7 +63,7 @@ class _Job:
 
 
 def run(
-    *, quick: bool = False, frames: int = 120, every: int = 1, data: Literal["even", "folds"] = "even", workers: int = 2
+    *, quick: bool = False, frames: int = 120, every: int = 1, data: Cloth = "even", workers: int = 2
 ) -> list[Metric]:
     """Simulate and scan takes of two fabrics with two seeds, or on two bodies in two motions.
 
@@ -65,7 +71,8 @@ def run(
         quick: small takes, the same keys: one of 16 frames, or two of 14 with folds here and there.
         frames: frames of each take.
         every: simulated frames to a captured one.
-        data: cloth with its excess everywhere alike, or with folds here and there.
+        data: cloth as `tshirt-200k` has it, excess everywhere alike; with folds here and there; or
+            trousers with such folds.
     """
     rows = []
     jobs = _jobs(frames, every, data, quick=quick)
@@ -76,6 +83,7 @@ def run(
     with tempfile.TemporaryDirectory(prefix="capture4d-synthesis-") as scratch:
         tiny = replace(PRESETS["tiny"], frames=2, capture_every=2)
         tiny = tiny if data == "even" else replace(folded(tiny), scans=False)
+        tiny = replace(tiny, garment="trousers") if data == "trousers" else tiny
         digests = {synthesise(Path(scratch) / str(count), tiny, workers=count).digest for count in (1, 2)}
 
     def mean(key: str) -> float:
@@ -117,17 +125,20 @@ def run(
         *(
             Metric(name, mean(name), FOLD_UNITS[key], "lower" if key == "calm_percent" else "higher")
             for key in FOLD_UNITS
-            for name in (key, *(f"{key}_{pose}" for pose in POSES))
+            for name in (key, *(f"{key}_{pose}" for pose in (MOMENTS if data == "trousers" else POSES)))
         ),
         *(Metric(f"{key}_least", least(f"{key}_least"), unit, "higher") for key, unit in FOLD_UNITS.items()),
     ]
 
 
-def _jobs(frames: int, every: int, data: Literal["even", "folds"], *, quick: bool) -> list[_Job]:
+def _jobs(frames: int, every: int, data: Cloth, *, quick: bool) -> list[_Job]:
     if quick:
         small = replace(PRESETS["tiny"], frames=16, capture_every=2)
         if data == "even":
             return [_Job(small, scan_every=8, converge_frames=10, late_start=6)]
+        if data == "trousers":
+            small = folded(replace(PRESETS["trousers-demo"], template_vertices=5000))
+            return [_Job(small, scan_every=7, converge_frames=10, late_start=4)]
         # Up to arms overhead, and sampled as finely as the folds' limits are stated for.
         small = folded(replace(small, frames=14, capture_every=4, template_vertices=5000))
         return [
@@ -140,6 +151,12 @@ def _jobs(frames: int, every: int, data: Literal["even", "folds"], *, quick: boo
             replace(folded(base), fabric="jersey"),
             replace(folded(base), fabric="shirt-cotton", seed=1, body_shape=OTHER_BODIES["heavy"]),
             replace(folded(base), fabric="shirt-cotton", seed=2, motion=MotionConfig("arm-circles")),
+        ]
+    elif data == "trousers":
+        base = folded(replace(PRESETS["trousers-200k"], frames=frames, capture_every=every))
+        takes = [
+            replace(base, motion=MotionConfig("walk")),
+            replace(base, fabric="denim", seed=1, body_shape=OTHER_BODIES["heavy"], motion=MotionConfig("squat")),
         ]
     else:
         takes = [replace(base, fabric=fabric, seed=seed) for fabric in ("jersey", "shirt-cotton") for seed in (0, 1)]
@@ -243,25 +260,37 @@ def _arms_up(take: TakePlan, index: int) -> float:
 
 
 def _folds(take: TakePlan, clip: list) -> dict[str, float]:
-    """Statistics of the trunk's folds, and compression of the fine cloth in its plane, in four poses of the arms."""
-    up = np.array([_arms_up(take, index) for index, _, _ in clip])
-    hanging = int(np.argmin(up))
-    overhead = hanging + int(np.argmax(up[hanging:]))
-    level = hanging + int(np.argmin(np.abs(up[hanging : overhead + 1])))
+    """Statistics of the trunk's folds, and compression of the fine cloth in its plane, in four poses of the arms; of
+    trousers those of thigh and shin, at four moments."""
+    looked_at = _moments(clip) if is_held_at_waist(take.config) else _poses(take, clip)
     to_fine, weights = locate(take.fine, take.template.vertex_uv)
     row: dict[str, float] = {}
-    for pose, position in (("rest", 0), ("hanging", hanging), ("half", level), ("overhead", overhead)):
+    for pose, position in looked_at.items():
         fine = clip[position][2].astype(np.float64)
         placed = np.einsum("vk,vkc->vc", weights, fine[take.fine.faces[to_fine]])
-        folds = fold_statistics(placed, take.template.faces, torso(placed))
+        chosen = legs(take.template, take.pattern) if is_held_at_waist(take.config) else torso(placed)
+        folds = fold_statistics(placed, take.template.faces, chosen)
         row[f"fold_p90_to_median_{pose}"] = folds.p90_to_median
         row[f"calm_percent_{pose}"] = folds.calm_percent
         row[f"fold_height_rms_mm_{pose}"] = folds.height_rms_mm
         row[f"compression_p1_{pose}"] = float(np.percentile(principal_stretches(take.fine, fine)[:, 0], 1))
     for key in FOLD_UNITS:
-        each = [row[f"{key}_{pose}"] for pose in POSES]
+        each = [row[f"{key}_{pose}"] for pose in looked_at]
         row[key], row[f"{key}_least"] = float(np.mean(each)), min(each)
     return row
+
+
+def _poses(take: TakePlan, clip: list) -> dict[str, int]:
+    """Where in a clip the arms are in each of `POSES`."""
+    up = np.array([_arms_up(take, index) for index, _, _ in clip])
+    hanging = int(np.argmin(up))
+    overhead = hanging + int(np.argmax(up[hanging:]))
+    level = hanging + int(np.argmin(np.abs(up[hanging : overhead + 1])))
+    return dict(zip(POSES, (0, hanging, level, overhead), strict=True))
+
+
+def _moments(clip: list) -> dict[str, int]:
+    return dict(zip(MOMENTS, np.linspace(0, len(clip) - 1, len(MOMENTS)).astype(int).tolist(), strict=True))
 
 
 def _determinism(job: _Job, normals: dict[int, np.ndarray]) -> float:
@@ -303,21 +332,33 @@ def _hem_sag(take: TakePlan, clip: list, frames: int) -> float:
     from the rest pose to hanging and begin to rise; 0 to 9 in the quick one.
     """
     harder = replace(take.config.simulation, iterations=4 * take.config.simulation.iterations)
-    start = dress(take.shaped, take.coarse, take.pattern, take.bodies[0])
+    worn = put_on(take.config, take.shaped, take.coarse, take.pattern, take.bodies[0])
     stop = take.lead + frames
     fabric = FABRICS[take.config.fabric]
-    hem = take.coarse.loops["hem"]
+    hem = np.concatenate([rows for name, rows in take.coarse.loops.items() if name.startswith(("hem", "leg"))])
     usual = {index: coarse for index, coarse, _ in clip}
     sags = [
         usual[step - take.lead][hem, 1].mean() - coarse[hem, 1].mean()
-        for step, coarse in enumerate(simulate(take.coarse, start, take.bodies[:stop], fabric, harder, made=take.made))
+        for step, coarse in enumerate(
+            simulate(
+                take.coarse,
+                worn.vertices,
+                take.bodies[:stop],
+                fabric,
+                harder,
+                made=take.made,
+                held_from=worn.held_from,
+            )
+        )
         if step - take.lead in usual
     ]
     return 1e3 * float(np.abs(sags).max())
 
 
 def _scans(take: TakePlan, clip: list) -> dict[str, float]:
-    extent = np.array([(fine.min(axis=0), fine.max(axis=0)) for _, _, fine in clip])
+    extent = np.array(
+        [in_view(take.config, fine, take.bodies[take.lead + index].vertices()) for index, _, fine in clip]
+    )
     rig = take_rig(take.config, extent)
     vertices, accuracy, angles, holes, cpu = [], [], [], [], 0.0
     for index, _, fine in clip:

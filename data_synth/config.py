@@ -232,10 +232,13 @@ class SynthConfig:
 
 def folded(config: SynthConfig) -> SynthConfig:
     """The same take in a garment that folds here and there: its sheet is coarser, for there are two meshes over it, and
-    hangs more freely below the chest."""
+    hangs more freely below the chest; a waistband keeps its hold."""
+    if config.folds is not None:
+        return config
     simulation, folds = config.simulation, FoldConfig()
-    simulation = replace(simulation, vertices=simulation.vertices // 2, substeps=32, iterations=1)
-    simulation = replace(simulation, damping=0.993, hold_hz=17.0, hold_floor=0.035)
+    simulation = replace(simulation, vertices=simulation.vertices // 2, substeps=32, iterations=1, damping=0.993)
+    if config.garment in (None, "shirt"):
+        simulation = replace(simulation, hold_hz=17.0, hold_floor=0.035)
     wide = replace(folds.wide, vertices=3 * config.relaxation.vertices // 20)
     return replace(config, folds=replace(folds, wide=wide), simulation=simulation)
 

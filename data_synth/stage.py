@@ -45,7 +45,7 @@ __all__ = [
     "simulation_jobs",
 ]
 
-SCHEMA = 2
+SCHEMA = 3
 SIMULATED = (
     "capture.json",
     "rig.json",

@@ -18,6 +18,8 @@ from data_synth.config import SimulationConfig
 
 __all__ = ["Hold", "Walls"]
 
+ARM_SIDES, ARM_BONES = (".L", ".R"), ("upperarm", "lowerarm")
+"""Of the body's joints."""
 WALL_MARGIN_M = 0.005
 """Room that sleeve and trunk keep to the plane between them, for the folds of both."""
 WALL_OPENING = 0.125
@@ -40,6 +42,8 @@ class Hold:
     """(V, J)."""
     stiffness: np.ndarray
     """(V, 1) spring constants, N/m."""
+    limbs: np.ndarray
+    """(V, 3) how freely each vertex goes along the left arm, the right arm, and the trunk, 0 to 1."""
 
     @staticmethod
     def take(
@@ -73,11 +77,36 @@ class Hold:
         below = np.maximum(held_from - rest[:, 1], 0) / config.hold_depth_m
         share = config.hold_floor + (1 - config.hold_floor) * np.exp(-(below**2))
         rest = rest + bumps[:, None] * vertex_normals(rest, mesh.faces)
-        return Hold(rest, weights, ((2 * np.pi * config.hold_hz) ** 2 * share * masses)[:, None])
+        limbs = np.zeros((len(rest), 3))
+        if made is not None and made.tailoring.sleeves:
+            names = body.shaped.body.joint_names
+            for column, side in enumerate(ARM_SIDES):
+                bones = [i for i, name in enumerate(names) if name.endswith(side) and name.startswith(ARM_BONES)]
+                limbs[:, column] = np.clip(weights[:, bones].sum(axis=1), 0, 1)
+            limbs[:, 2] = (1 - limbs[:, :2].sum(axis=1)) * (1 - np.exp(-(below**2)))
+        return Hold(rest, weights, ((2 * np.pi * config.hold_hz) ** 2 * share * masses)[:, None], limbs)
 
     def places(self, body: PosedBody) -> np.ndarray:
         """Where the springs end in a pose, (V, 3) metres."""
         return skin(self.rest, self.skin_weights, body.transforms)
+
+    def slides(self, body: PosedBody) -> np.ndarray:
+        """Directions, (V, 3) of length 0 to 1, along which cloth goes up and down an arm or the trunk as it likes.
+
+        Skin along a shoulder seam is half as long again with arms low as with arms up, and cloth is not; a shirt whose
+        arms are overhead goes up.
+        """
+        names, centres = body.shaped.body.joint_names, body.joint_centres()
+        ends = [(f"upperarm01{side}", f"lowerarm01{side}") for side in ARM_SIDES] + [("neck01", "root")]
+        axes = np.array([centres[names.index(end)] - centres[names.index(start)] for start, end in ends])
+        slides = np.sqrt(self.limbs) @ (axes / np.linalg.norm(axes, axis=1, keepdims=True))
+        # Where an arm and the trunk share a vertex: longer than 1, it would be driven from its place.
+        return slides / np.maximum(np.linalg.norm(slides, axis=1, keepdims=True), 1)
+
+    def forces(self, places: np.ndarray, slides: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """What pulls some points, (V, 3), to their places, but for the way along their slides, (V, 3) N."""
+        away = places - points
+        return self.stiffness * (away - slides * (slides * away).sum(axis=1, keepdims=True))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -42,7 +42,7 @@ LIFT_M = 0.035
 """The panels start this far above their place, clear of the shoulders."""
 BODY_MARGIN_M = 0.002
 """Room that the sheet keeps to the body."""
-UNTANGLE_M = 0.01
+UNTANGLE_M = 0.003
 """Farthest that a vertex moves in one frame to part from cloth that it has passed through."""
 PILLOW_M = 0.13
 """Distance from the seams over which front and back part."""
@@ -245,6 +245,7 @@ def simulate(
             masses = model.particle_mass.numpy()
             hold = Hold.take(mesh, cloth, bodies[frame - 1], masses, config, made=made, held_from=held_from)
         held = None if hold is None else (hold.places(bodies[frame - 1]), hold.places(bodies[frame]))
+        slides = None if hold is None else hold.slides(bodies[frame])
         calm = frame <= config.calm_frames
         between = Walls.of(made, bodies[frame], model.particle_mass.numpy())
         model.set_gravity(tuple(gravity * (0.5 if calm else 1.0)))
@@ -255,10 +256,9 @@ def simulate(
             if body.mesh.velocities is not None:
                 body.mesh.velocities.assign(((current - previous) * config.fps).astype(np.float32))
             state.clear_forces()
-            if hold is not None and held is not None:
-                places = (1 - blend) * held[0] + blend * held[1]
+            if hold is not None and held is not None and slides is not None:
                 points = state.particle_q.numpy()
-                forces = hold.stiffness * (places - points)
+                forces = hold.forces((1 - blend) * held[0] + blend * held[1], slides, points)
                 if between is not None:
                     between.push(points, forces)
                 state.particle_f.assign(forces.astype(np.float32))

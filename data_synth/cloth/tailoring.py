@@ -1,8 +1,8 @@
 """Where a garment has more cloth than it needs, and how it was sewn: fields over its pattern, for any mesh of it.
 
 A worn shirt lies calm over chest and shoulder blades and has too much cloth elsewhere, here more, there less. The
-excess is a share of the cloth's size, across and along the grain: a calm zone of shirts, and patches of log-normal
-noise.
+excess is a share of the cloth's size, across and along the grain: a calm zone of shirts or a waist, and patches of
+log-normal noise.
 
 Letters: V vertices, F faces; u across, v along the grain, metres.
 """
@@ -32,6 +32,8 @@ CALM_ASIDE = (0.55, 0.95)
 """Shares of the half width between which it ends towards the sides."""
 YOKE_M = (0.0, 0.06)
 """Above the underarm, between these, it widens to the armholes, and begins on the sleeves' caps."""
+WAIST_M = (0.04, 0.14)
+"""Below a waist, between these, trousers and skirts begin to fold: a waistband has no more cloth than it needs."""
 WALL_LEANS, WALL_RETREAT_M = (0.45, 0.75), 0.15
 """Between these sines of an arm's angle out of the body's frontal plane its wall gives way, by this at most: an arm
 that points forwards has the chest on its own side."""
@@ -155,11 +157,14 @@ def _draft(mesh: PanelMesh, pattern: Pattern, uv: np.ndarray, panels: np.ndarray
 
 
 def _calm(mesh: PanelMesh, pattern: Pattern) -> np.ndarray:
-    """(F,) 1 where a shirt lies calm: chest, shoulder blades, yoke, sleeve caps; 0 elsewhere and on other garments."""
-    names = [panel.name for panel in pattern.panels]
+    """(F,) 1 where a shirt lies calm: chest, shoulder blades, yoke, sleeve caps; at a waist; 0 elsewhere."""
+    names, middle = [panel.name for panel in pattern.panels], mesh.uv.mean(axis=1)
+    if "waist" in mesh.loops:
+        from_waist = KDTree(mesh.uv[np.isin(mesh.faces, mesh.loops["waist"])]).query(middle)[0]
+        return 1 - _smooth_step(from_waist, *WAIST_M)
     if not {"front", "back", "sleeve_left"} <= set(names):
         return np.zeros(len(mesh.faces))
-    middle, panels = mesh.uv.mean(axis=1), np.array(names)[mesh.face_panels]
+    panels = np.array(names)[mesh.face_panels]
     u, v = _draft(mesh, pattern, middle, mesh.face_panels)
     over_underarm = _smooth_step(v, *YOKE_M)
     aside = (1 - over_underarm) * _smooth_step(np.abs(u), *CALM_ASIDE)

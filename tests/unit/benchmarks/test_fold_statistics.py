@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.fold_statistics import BAND_M, fold_statistics, smoothed
+from benchmarks.fold_statistics import BAND_M, fold_statistics, legs, smoothed
+from data_synth.cloth.panels import Panel, Pattern
+from data_synth.cloth.patterns import PanelMesh
 
 WIDTH_M, STEP_M = 0.04, 0.004
 
@@ -42,6 +44,27 @@ def test_folds_everywhere_are_even_and_folds_here_and_there_are_not() -> None:
     assert even.calm_percent < 15
     assert uneven.p90_to_median > 2 * even.p90_to_median
     assert 45 < uneven.calm_percent < 70
+
+
+def test_thigh_and_shin_lie_between_hems_and_crotch_of_their_own_panel() -> None:
+    """Two legs, 0.1 to 1.1 high as drafted, sewn up to 0.7, laid out 0.3 and 0 lower."""
+    drafted = 0.1 + 0.05 * np.arange(21)
+    origins = np.array([[0.0, -0.3], [1.0, 0.0]])
+    corners = np.stack([np.arange(19), np.arange(1, 20), np.arange(2, 21)], axis=1)
+    sides = {"left": np.arange(21), "right": np.arange(21, 42)}
+    uv = np.concatenate([np.column_stack([np.full(21, u), drafted + v]) for u, v in origins])
+    faces = np.concatenate([corners, corners + 21]).astype(np.int32)
+    mesh = PanelMesh(
+        faces,
+        uv[faces],
+        np.repeat([0, 1], 19),
+        uv,
+        np.array([np.flatnonzero((faces == vertex).any(axis=1))[0] for vertex in range(42)]),
+        {f"leg_{side}": rows[:1] for side, rows in sides.items()},
+        {f"in_{side}": rows[drafted < 0.71] for side, rows in sides.items()},
+    )
+    chosen = legs(mesh, Pattern(tuple(Panel("leg", (), origin) for origin in origins), ("leg_left", "leg_right")))
+    np.testing.assert_array_equal(chosen, np.tile((drafted > 0.13) & (drafted < 0.67), 2))
 
 
 def test_smoothing_keeps_the_centre_of_mass_and_a_turn_of_the_world() -> None:

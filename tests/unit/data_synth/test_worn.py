@@ -15,7 +15,15 @@ from capture4d.errors import InputError
 from capture4d.geometry.ray_casting import TriangleScene
 from data_synth.cloth.patterns import mesh_pattern
 from data_synth.cloth.tshirt import tshirt_pattern
-from data_synth.config import PRESETS, TRAINING_SETS, MotionConfig, RelaxationConfig, SynthConfig, folded
+from data_synth.config import (
+    PRESETS,
+    TRAINING_SETS,
+    MotionConfig,
+    RelaxationConfig,
+    SynthConfig,
+    folded,
+)
+from data_synth.stage import SCHEMA
 from data_synth.take import in_view, plan_take, simulate_take
 from data_synth.worn import draft, dressing_pose, put_on, template_weights
 
@@ -89,7 +97,7 @@ def test_takes_made_before_there_were_other_garments_keep_their_place(tmp_path, 
         known = asdict(config)
         for later in ("print", "print_mm", "garment", "cut", "skirt_weights", "folds"):
             assert known.pop(later) is None
-        key = hashlib.sha256(json.dumps([2, known], sort_keys=True).encode()).hexdigest()[:12]
+        key = hashlib.sha256(json.dumps([SCHEMA, known], sort_keys=True).encode()).hexdigest()[:12]
         assert cached_take(config).name == f"{config.name}-{key}"
     assert all(take.garment is None for each in TRAINING_SETS.values() for take in each.takes.values())
 
@@ -148,3 +156,9 @@ def test_large_shirts_fold_here_and_there_on_a_coarser_sheet() -> None:
         assert config.simulation.vertices < even.simulation.vertices
     assert PRESETS["tshirt-200k"] == folded(SynthConfig(name="tshirt-200k", frames=212))
     assert all(take.folds is None for take in TRAINING_SETS["tshirt-train"].takes.values())
+
+
+def test_what_folds_here_and_there_already_stays_as_it_is() -> None:
+    once = folded(PRESETS["tshirt-linen-200k"])
+    assert once.folds is not None
+    assert folded(once) is once
