@@ -24,14 +24,18 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.cached_takes import one_maker
+from benchmarks.clip_smoothness import clip_smoothness
 from benchmarks.metric import Metric
 from benchmarks.wrong_bodies import wrong_body_metrics
 from capture4d.cache import user_cache_folder
 from capture4d.files.atomic import read_json
+from capture4d.types import PoseSequence
 from data_synth.drapes.config import DrapesConfig
 from data_synth.drapes.stage import SCHEMA
 from data_synth.drapes.stage import run as make_drapes
 from wrinkles.offset_images.config import PRESETS, DrapeOffsetsConfig, PatchConfig
+from wrinkles.offset_images.drape_lessons import read_parted_drapes, still_poses
+from wrinkles.offset_images.drape_model import load_drape_offsets
 from wrinkles.offset_images.train_stage import ERRORS
 from wrinkles.offset_images.train_stage import run as train
 
@@ -74,6 +78,8 @@ PAPER: Mapping[str, tuple[float, float]] = {
 }
 SINGLE = ("decoder", "decoder_l1", "decoder_l2", "patches", "direct", "pca")
 """Networks that answer alone, in local offsets."""
+CLIPS, PATH = ("kernels", "direct_with_kernels", "decoder"), 4
+"""Models whose motions are measured, and on how many poses one after the other."""
 
 
 def drape_metrics(
@@ -140,8 +146,16 @@ def _learned(
         for name, config in configs.items():
             model = train(drapes, (folder or usual) / name, config, workers=workers).path
             errors[name] = read_json(model / ERRORS)
+            if name in CLIPS:
+                errors[name]["clip"] = asdict(clip_smoothness(load_drape_offsets(model), _path(drapes)))
             Console(stderr=True).print(f"{name}: {_told(errors[name])}", soft_wrap=True)
     return errors
+
+
+def _path(drapes: Path) -> PoseSequence:
+    """Some poses for tests, to go along."""
+    found, parts = read_parted_drapes(drapes)
+    return still_poses(found, parts.test[:PATH])
 
 
 def _configs(sizes: _Sizes, epochs: int, baseline_epochs: int, scale: Scale) -> dict[str, DrapeOffsetsConfig]:
@@ -190,6 +204,9 @@ def _metrics(errors: Mapping[str, Mapping[str, Any]]) -> list[Metric]:
         Metric("best_to_kernel", best / test["kernels"]),
         Metric("normals_to_l2", errors["decoder"]["train"]["normal"] / errors["decoder_l2"]["train"]["normal"]),
     ]
+    for name in CLIPS:
+        clip = errors[name]["clip"]
+        found += [Metric(f"clip_{name}_to_carried", clip["to_carried"]), Metric(f"clip_{name}_halved", clip["halved"])]
     if "direct_root" in errors:
         found.append(Metric("local_to_root_direct", test["direct"] / test["direct_root"]))
     if "patches" in errors:

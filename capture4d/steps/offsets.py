@@ -27,7 +27,7 @@ __all__ = [
 def wrinkles_offsets(
     work: AnyWork, config: OffsetConfig | None = None, *, workers: int = 1, overwrite: bool = False
 ) -> StageResult:
-    """Learn offset images of a registered take from its poses, and a baseline: WORK/wrinkles/offsets."""
+    """Learn offset images of a registered take from its poses, and baselines: WORK/wrinkles/offsets."""
     from wrinkles.offset_images.model_files import OFFSETS
     from wrinkles.offset_images.stage import run as stage
 

@@ -32,7 +32,7 @@ from capture4d.types import Body, Garment, PoseSequence
 from capture4d.value_checks import require_array, require_finite
 from wrinkles.offset_images.canvas import OffsetSampler, Window
 from wrinkles.offset_images.config import DrapeOffsetsConfig, PatchConfig, StripConfig
-from wrinkles.offset_images.frames import CM
+from wrinkles.offset_images.frames import CM, pose_rows
 from wrinkles.offset_images.kernels import PoseKernels
 from wrinkles.offset_images.layout import OffsetLayout, decode, worn_part
 from wrinkles.offset_images.networks import (
@@ -173,8 +173,7 @@ class DrapeOffsets:
         found = np.empty((len(poses.frame_ids), len(self.layout.garment.template.vertices), 3))
         for start in range(0, len(found), 64):
             rows = range(start, min(start + 64, len(found)))
-            pose = torch.from_numpy(np.ascontiguousarray(poses.rotations[rows][:, joints]).reshape(len(rows), -1))
-            offsets = self.offsets(pose).double().numpy() / CM
+            offsets = self.offsets(pose_rows(poses.rotations[rows], joints)).double().numpy() / CM
             for row, own in zip(rows, offsets, strict=True):
                 anchors = near.anchors(pose_frame(person, poses, row), self.parts.config.space)
                 found[row] = self.layout.vertices(decode(anchors, own))

@@ -17,7 +17,7 @@ from capture4d.body.skinning import pose_frame, with_shape
 from capture4d.types import Body, PoseSequence
 from wrinkles.offset_images.layout import OffsetLayout, OffsetSpace, encode, worn_part
 
-__all__ = ["CM", "OffsetFrames", "joined_frames", "offset_frames", "pose_joints", "vertex_errors_cm"]
+__all__ = ["CM", "OffsetFrames", "joined_frames", "offset_frames", "pose_joints", "pose_rows", "vertex_errors_cm"]
 
 CM = 100.0
 
@@ -92,10 +92,18 @@ def offset_frames(
     def stacked(arrays: list[np.ndarray]) -> Tensor:
         return torch.from_numpy(np.stack(arrays).astype(np.float32))
 
-    pose = torch.from_numpy(np.ascontiguousarray(poses.rotations[:, joints]).reshape(len(vertices), -1))
+    pose = pose_rows(poses.rotations, joints)
     return OffsetFrames(
         pose, stacked(offsets), stacked(points), stacked(axes), CM * torch.from_numpy(np.array(vertices))
     )
+
+
+def pose_rows(
+    rotations: Float[np.ndarray, "frames all 3 3"], joints: Int[np.ndarray, " joints"] | Sequence[int]
+) -> Float[Tensor, "frames pose"]:
+    """What a network sees of poses: the rotation matrices of some joints, flattened."""
+    seen = np.ascontiguousarray(rotations[:, joints]).astype(np.float32, copy=False)
+    return torch.from_numpy(seen.reshape(len(rotations), -1))
 
 
 def vertex_errors_cm(made: Float[Tensor, "frames V 3"], truth: Float[Tensor, "frames V 3"]) -> float:

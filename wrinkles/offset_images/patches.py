@@ -17,15 +17,16 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, Int, Int32
-from torch import Tensor
+from torch import Tensor, nn
 
 from capture4d.errors import InputError
 from capture4d.geometry.mesh import doubled_area_vectors, normalised
+from capture4d.learning.networks import ImageDecoder
 from wrinkles.offset_images.canvas import OffsetSampler, Window
 from wrinkles.offset_images.layout import OffsetLayout
 from wrinkles.offset_images.networks import principal_offsets
 
-__all__ = ["OffsetFilter", "cut_windows", "even_labels", "kink_deg", "stitched", "strip_window"]
+__all__ = ["OffsetFilter", "Patchwork", "cut_windows", "even_labels", "kink_deg", "stitched", "strip_window"]
 
 
 def even_labels(layout: OffsetLayout, count: int) -> Int32[np.ndarray, " F"]:
@@ -152,8 +153,38 @@ class OffsetFilter:
         return OffsetFilter(mean.numpy(), basis.numpy())
 
     def __call__(self, offsets: Float[Tensor, "frames P 3"]) -> Float[Tensor, "frames P 3"]:
-        basis, mean = torch.from_numpy(self.basis), torch.from_numpy(self.mean)
-        return (mean + (offsets.flatten(1) - mean) @ basis.T @ basis).view_as(offsets)
+        return _projected(offsets, torch.from_numpy(self.mean), torch.from_numpy(self.basis))
+
+
+class Patchwork(nn.Module):
+    """The decoders of all patches and the filter as one network: from a pose to the offsets of all cloth pixels."""
+
+    mean: Tensor
+    basis: Tensor
+
+    def __init__(
+        self,
+        layout: OffsetLayout,
+        samplers: Sequence[OffsetSampler],
+        decoders: Sequence[ImageDecoder],
+        kept: OffsetFilter,
+    ) -> None:
+        super().__init__()
+        self.decoders = nn.ModuleList(decoders)
+        self.layout = layout
+        self.samplers = list(samplers)  # they follow from the layout, and are no weights
+        self.register_buffer("mean", torch.from_numpy(kept.mean))
+        self.register_buffer("basis", torch.from_numpy(kept.basis))
+
+    def forward(self, pose: Float[Tensor, "B pose"]) -> Float[Tensor, "B P 3"]:
+        made = [sampler(decoder(pose)) for sampler, decoder in zip(self.samplers, self.decoders, strict=True)]
+        return _projected(stitched(self.layout, list(zip(self.samplers, made, strict=True))), self.mean, self.basis)
+
+
+def _projected(
+    offsets: Float[Tensor, "B P 3"], mean: Float[Tensor, " values"], basis: Float[Tensor, "K values"]
+) -> Float[Tensor, "B P 3"]:
+    return (mean + (offsets.flatten(1) - mean) @ basis.T @ basis).view_as(offsets)
 
 
 def kink_deg(

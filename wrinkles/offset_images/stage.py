@@ -2,7 +2,9 @@
 
 stage.json                       what was run
 decoder.safetensors              from poses to images of offsets
-fully_connected_pca.safetensors  the baseline without images: from poses to principal components of the offsets
+patches.safetensors              the same in patches, if they were asked for, and what stitches them
+fully_connected.safetensors      a baseline without images: from poses to all offsets
+fully_connected_pca.safetensors  another: from poses to principal components of the offsets
 frames.json                      frames that were learned from, that chose the epoch, and that were held out
 metrics.jsonl                    loss and validation error of every epoch
 checkpoints/decoder-000010.safetensors   everything a resume needs; the last one of each network is kept
@@ -26,26 +28,30 @@ from capture4d.errors import InputError
 from capture4d.files.atomic import write_json
 from capture4d.runs.stage import Stage, StageResult, open_stage
 from wrinkles.frame_split import split_rows
+from wrinkles.offset_images.canvas import OffsetSampler, drawn_values
 from wrinkles.offset_images.config import OffsetConfig
 from wrinkles.offset_images.frames import offset_frames, pose_joints
 from wrinkles.offset_images.layout import OffsetLayout
 from wrinkles.offset_images.model_files import (
-    BASELINE,
     DECODER,
+    DIRECT,
     FRAMES,
     NETWORKS,
+    PATCHES,
     STAGE,
     OffsetModel,
     load_offset_model,
     save_offset_model,
+    small_patch_decoder,
 )
-from wrinkles.offset_images.networks import PcaFullyConnected, image_decoder
+from wrinkles.offset_images.networks import FullyConnected, PcaFullyConnected, image_decoder
+from wrinkles.offset_images.patches import OffsetFilter, Patchwork, cut_windows, even_labels
 from wrinkles.offset_images.resumable import METRICS, TrainingLog, train_resumably
 from wrinkles.offset_images.training import OffsetLesson, start_training
 
 __all__ = ["run"]
 
-SCHEMA = 2
+SCHEMA = 3
 COMMAND = "capture4d wrinkles offsets WORK"
 BATCHES, SMALLEST_BATCH = 8, 4
 """A short take is learned from in as many batches, unless they become too small for batch norm."""
@@ -65,7 +71,7 @@ class _Parts:
 def run(
     work: WorkFolder, output: Path, config: OffsetConfig, *, workers: int = 1, overwrite: bool = False
 ) -> StageResult:
-    """Learn the decoder and the baseline, unless that has been done.
+    """Learn decoder and baselines, and patches if they are asked for, unless that has been done.
 
     Equal inputs, settings and numbers of `workers`, which are torch's threads here, give equal weights, however often
     the run was interrupted.
@@ -89,7 +95,8 @@ def run(
     stage = open_stage(
         output, name=STAGE, schema=SCHEMA, config=config, upstream={"registration": digest}, overwrite=overwrite
     )
-    products = [stage.path / FRAMES, *(_model(stage, name) for name in NETWORKS)]
+    names = [name for name in NETWORKS if name != PATCHES or config.patched]
+    products = [stage.path / FRAMES, *(_model(stage, name) for name in names)]
     if stage.was_complete and all(path.is_file() for path in [*products, stage.path / METRICS]):
         return stage.finish(products, changed=False)
     torch.set_num_threads(workers)
@@ -102,7 +109,7 @@ def run(
     lesson = OffsetLesson(layout, encoded(parts.learned), encoded(parts.chose_epoch))
     frames = {name: sequence.frame_ids[list(getattr(parts, name))] for name in _Parts.__dataclass_fields__}
     write_json(stage.path / FRAMES, frames)
-    _learn(stage, lesson, joints, config)
+    _learn(stage, names, lesson, joints, config)
     return stage.finish(products)
 
 
@@ -118,25 +125,64 @@ def _split(work: WorkFolder, frame_ids: Int[np.ndarray, " frames"], config: Offs
     return _Parts(sound[:cut], sound[cut:], end)
 
 
-def _learn(stage: Stage, lesson: OffsetLesson, joints: Int[np.ndarray, " joints"], config: OffsetConfig) -> None:
-    """Train what is not trained yet, one network after the other."""
+def _learn(
+    stage: Stage,
+    names: Sequence[str],
+    lesson: OffsetLesson,
+    joints: Int[np.ndarray, " joints"],
+    config: OffsetConfig,
+) -> None:
+    """Train what is not trained yet, one network after the other; each is made from the seed anew."""
     batch = min(config.training.batch, max(SMALLEST_BATCH, len(lesson.train) // BATCHES))
     settings = replace(config.training, batch=batch)
-    pose_size = lesson.train.pose.shape[1]
-    torch.manual_seed(settings.seed)  # both are made before either learns: what one draws does not hang on the other
-    networks = {
-        DECODER: image_decoder(pose_size, config.texels),
-        BASELINE: PcaFullyConnected.analysed(pose_size, lesson.train.offsets, components=config.components),
-    }
     before: list[Mapping[str, Any]] = []
-    for name, network in networks.items():
+    for name in names:
         path = _model(stage, name)
         if not path.is_file():
-            training = start_training(network, lesson, settings)
-            history = train_resumably(TrainingLog(stage.path, COMMAND, before), name, training, settings)
-            save_offset_model(path, OffsetModel(network, joints, config.texels, history))
-        before += load_offset_model(path).history
+            log = TrainingLog(stage.path, COMMAND, before)
+            save_offset_model(path, _learned(name, lesson, joints, replace(config, training=settings), log))
+        before += load_offset_model(path, lesson.layout.garment).history
         TrainingLog(stage.path, COMMAND, before).write([])
+
+
+def _learned(
+    name: str, lesson: OffsetLesson, joints: Int[np.ndarray, " joints"], config: OffsetConfig, log: TrainingLog
+) -> OffsetModel:
+    layout, train, settings = lesson.layout, lesson.train, config.training
+    pose_size = train.pose.shape[1]
+    if name == PATCHES:
+        return _learned_patches(lesson, joints, config, log)
+    torch.manual_seed(settings.seed)
+    if name == DECODER:
+        network = image_decoder(pose_size, config.texels)
+    elif name == DIRECT:
+        network = FullyConnected(pose_size, len(layout.vertex))
+    else:
+        network = PcaFullyConnected.analysed(pose_size, train.offsets, components=config.components)
+    history = train_resumably(log, name, start_training(network, lesson, settings), settings)
+    return OffsetModel(network, joints, layout, history)
+
+
+def _learned_patches(
+    lesson: OffsetLesson, joints: Int[np.ndarray, " joints"], config: OffsetConfig, log: TrainingLog
+) -> OffsetModel:
+    layout, patch = lesson.layout, config.patch
+    labels = even_labels(layout, patch.count)
+    windows = cut_windows(layout, labels, patch.texels, patch.context)
+    values = torch.from_numpy(drawn_values(layout, lesson.train.offsets.numpy()))
+    decoders, history = [], []
+    for index, window in enumerate(windows):
+        settings = replace(config.training, seed=(config.training.seed + index) % 2**63)
+        torch.manual_seed(settings.seed)
+        decoder = small_patch_decoder(lesson.train.pose.shape[1], patch)
+        task = replace(lesson, window=window, values=values)
+        name = f"{PATCHES}-{index + 1:02d}"
+        so_far = replace(log, before=[*log.before, *history])
+        history += train_resumably(so_far, name, start_training(decoder, task, settings), settings)
+        decoders.append(decoder)
+    samplers = [OffsetSampler(layout, window) for window in windows]
+    kept = OffsetFilter.learned(lesson.train.offsets, len(lesson.train))
+    return OffsetModel(Patchwork(layout, samplers, decoders, kept), joints, layout, history, labels, patch)
 
 
 def _model(stage: Stage, name: str) -> Path:

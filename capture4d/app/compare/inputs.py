@@ -82,7 +82,7 @@ def open_inputs(
     generator = load_model(weights)
     pairs = ensure_pairs(work, PairConfig(map=generator.maps), workers=workers)
     known = _garment_model(work.path, garment_model)
-    offsets = find_offsets(work.path, registration=pairs.registration)
+    offsets = find_offsets(work.path, work.registered.garment, registration=pairs.registration)
     upstream = {
         "registration": pairs.registration,
         "pairs": pairs.digest,

@@ -15,19 +15,21 @@ from capture4d.app.compare.garment import MB, ModelledSurface
 from capture4d.types import Body, PoseSequence, RegisteredSequence
 from wrinkles.offset_images.canvas import OffsetSampler
 from wrinkles.offset_images.frames import offset_frames
-from wrinkles.offset_images.layout import OffsetLayout
-from wrinkles.offset_images.model_files import BASELINE, DECODER, LearnedOffsets, OffsetModel
+from wrinkles.offset_images.model_files import BASELINE, DECODER, DIRECT, PATCHES, LearnedOffsets, OffsetModel
 from wrinkles.offset_images.training import predict
 
 __all__ = ["megabytes", "offset_surfaces"]
 
-_IN_WORDS = {DECODER: "offset images", BASELINE: "fully connected, PCA"}
+_IN_WORDS = {
+    DECODER: "offset images", PATCHES: "offset images, patches", DIRECT: "fully connected",
+    BASELINE: "fully connected, PCA",
+}  # fmt: skip
 
 
 def offset_surfaces(
     offsets: LearnedOffsets, sequence: RegisteredSequence, body: Body, poses: PoseSequence, rows: Sequence[int]
 ) -> list[ModelledSurface]:
-    """What decoder and baseline make of some frames' poses.
+    """What decoder, patches and baselines make of some frames' poses.
 
     Args:
         sequence, body, poses: the take they were learned from, and what moved it.
@@ -38,12 +40,9 @@ def offset_surfaces(
     wanted = list(rows)
     moved = poses.of_frames(sequence.frame_ids[wanted])
     vertices = np.array(sequence.vertices[wanted])
-    layouts: dict[int, OffsetLayout] = {}
     surfaces = []
     for name, model in offsets.models.items():
-        layout = layouts.get(model.texels) or OffsetLayout.create(sequence.garment, model.texels)
-        layouts[model.texels] = layout
-        made, ms = _predicted(model, layout, body, moved, vertices)
+        made, ms = _predicted(model, body, moved, vertices)
         surfaces.append(ModelledSurface(_IN_WORDS[name], made, ms, megabytes(model.network)))
     return surfaces
 
@@ -53,11 +52,10 @@ def megabytes(network: torch.nn.Module) -> float:
     return sum(each.numel() * each.element_size() for each in network.state_dict().values()) / MB
 
 
-def _predicted(
-    model: OffsetModel, layout: OffsetLayout, body: Body, poses: PoseSequence, vertices: np.ndarray
-) -> tuple[np.ndarray, float]:
+def _predicted(model: OffsetModel, body: Body, poses: PoseSequence, vertices: np.ndarray) -> tuple[np.ndarray, float]:
     """Vertices (T, V, 3), metres, and the median time of a frame alone, ms."""
-    frames, sampler = offset_frames(layout, body, poses, vertices, model.joints), OffsetSampler(layout)
+    frames = offset_frames(model.layout, body, poses, vertices, model.joints)
+    sampler = OffsetSampler(model.layout)
     made, times = [], []
     for row in range(len(frames)):
         begin = time.perf_counter()

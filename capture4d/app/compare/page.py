@@ -6,8 +6,8 @@ registration        the template as registered, without a map
 blendshapes         the registration, projected on a learned garment's principal directions
 regression          the learned garment from the poses alone: linear, by the LSTM, by kernels, by both of these
 network             the registration with maps made by a trained generator
-offset images       vertices decoded from an image that a network predicts from the pose alone
-fully connected     the same with a fully connected network on principal components
+offset images       vertices decoded from an image that a network predicts from the pose alone, whole or in patches
+fully connected     the same with a fully connected network, to all offsets or to principal components
 
 docs/methods/wrinkles.md defines the measures.
 """
@@ -36,7 +36,7 @@ from capture4d.runs.stage import Stage, StageResult, open_stage
 
 __all__ = ["run"]
 
-SCHEMA = 5
+SCHEMA = 6
 
 
 def run(

@@ -107,7 +107,7 @@ class WrinklesApply(StageOptions, MeshOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class WrinklesOffsets(StageOptions, MeshOptions):
-    """Learn offset images of a registered take from its poses, and a baseline without images; `compare` shows them."""
+    """Learn offset images of a registered take from its poses, and baselines without images; `compare` shows them."""
 
     work: Annotated[Positional[Path], arg(metavar="WORK")]
     """Work folder; holds registration/, gets wrinkles/offsets/."""

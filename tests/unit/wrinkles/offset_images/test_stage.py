@@ -18,16 +18,17 @@ from tests.unit.wrinkles.conftest import make_work, outside_the_unit_square, som
 from tests.unit.wrinkles.offset_images.test_layout import limb, turned, upright
 from wrinkles.offset_images import resumable, stage
 from wrinkles.offset_images.canvas import OffsetSampler
-from wrinkles.offset_images.config import OffsetConfig, OffsetTrainingConfig
+from wrinkles.offset_images.config import OffsetConfig, OffsetTrainingConfig, PatchConfig
 from wrinkles.offset_images.frames import offset_frames, vertex_errors_cm
-from wrinkles.offset_images.layout import OffsetLayout
 from wrinkles.offset_images.model_files import NETWORKS, OFFSETS, find_offsets, load_offset_model
 from wrinkles.offset_images.training import predict
 
 FRAMES = 12
 CONFIG = OffsetConfig(
-    held_out=0.2, texels=32, components=4, training=OffsetTrainingConfig(epochs=5, checkpoint_every=2)
-)
+    held_out=0.2, texels=32, components=4, training=OffsetTrainingConfig(epochs=5, checkpoint_every=2), patched=True,
+    patch=PatchConfig(count=2, texels=32, context=2, channels=16),
+)  # fmt: skip
+LOGGED = ("decoder", "patches-01", "patches-02", "fully_connected", "fully_connected_pca")
 
 
 def bound_work(folder: Path, frames: int, *, bend: float = 0.0) -> Path:
@@ -84,21 +85,27 @@ def test_networks_are_kept_as_they_were_best(taken: Path, learned: Path):
     # two of twelve are held out behind a gap of two; a ninth of the rest, one at least, chooses the epoch
     assert frames == {"learned": list(range(1, 8)), "chose_epoch": [8], "held_out": [11, 12]}
     rows = [json.loads(line) for line in (learned / "metrics.jsonl").read_text().splitlines()]
-    assert [(row["network"], row["epoch"]) for row in rows] == [(name, at) for name in NETWORKS for at in range(1, 6)]
+    assert [(row["network"], row["epoch"]) for row in rows] == [(name, at) for name in LOGGED for at in range(1, 6)]
     opened = open_work(taken)
     sequence, (body, poses) = opened.registered, opened.require_posed_body()
     chose = [7]
     for name in NETWORKS:
-        model = load_offset_model(learned / f"{name}.safetensors")
-        layout = OffsetLayout.create(sequence.garment, 32)
+        model = load_offset_model(learned / f"{name}.safetensors", sequence.garment)
         poses_then = poses.of_frames(sequence.frame_ids[chose])
-        seen = offset_frames(layout, body, poses_then, np.array(sequence.vertices[chose]), model.joints)
-        found = vertex_errors_cm(predict(model.network, OffsetSampler(layout), seen), seen.vertices)
-        assert found == pytest.approx(min(row["validation_cm"] for row in rows if row["network"] == name), rel=1e-5)
+        seen = offset_frames(model.layout, body, poses_then, np.array(sequence.vertices[chose]), model.joints)
+        found = vertex_errors_cm(predict(model.network, OffsetSampler(model.layout), seen), seen.vertices)
+        if name != "patches":
+            best = min(row["validation_cm"] for row in rows if row["network"] == name)
+            assert found == pytest.approx(best, rel=1e-5)
+            continue
+        # of two patches each is as it was best on its own vertices; the filter knows the frames that were learned
+        best = [min(row["validation_cm"] for row in rows if row["network"] == each) for each in LOGGED[1:3]]
+        assert min(best) / 2 < found < 2 * max(best)
 
 
 def test_what_was_learned_is_found_again(taken: Path, learned: Path):
-    found = find_offsets(taken, registration=open_work(taken).registered_digest)
+    opened = open_work(taken)
+    found = find_offsets(taken, opened.registered.garment, registration=opened.registered_digest)
     assert found is not None
     assert tuple(found.models) == NETWORKS
     assert (found.held_out, found.gap, found.seen) == (0.2, 10, frozenset(range(1, 9)))
@@ -107,7 +114,9 @@ def test_what_was_learned_is_found_again(taken: Path, learned: Path):
     assert contents(learned) == before
 
 
-@pytest.mark.parametrize("stop", [1, 4, 8], ids=["before a checkpoint", "in the decoder", "in the baseline"])
+@pytest.mark.parametrize(
+    "stop", [1, 4, 13, 18], ids=["before a checkpoint", "in the decoder", "in a patch", "in a baseline"]
+)
 def test_a_stopped_training_ends_with_the_same_bits(
     work: Path, learned: Path, monkeypatch: pytest.MonkeyPatch, stop: int
 ):
@@ -130,9 +139,10 @@ def test_a_stopped_training_ends_with_the_same_bits(
         assert again[name] == data, name
 
 
-def test_a_lost_network_is_learned_again_alike(work: Path, learned: Path):
+@pytest.mark.parametrize("name", NETWORKS[1:])
+def test_a_lost_network_is_learned_again_alike(work: Path, learned: Path, name: str):
     shutil.copytree(learned, work / OFFSETS)
-    path = work / OFFSETS / "fully_connected_pca.safetensors"
+    path = work / OFFSETS / f"{name}.safetensors"
     path.unlink()
     shutil.rmtree(work / OFFSETS / "checkpoints")
     stage.run(open_work(work), work / OFFSETS, CONFIG)
@@ -182,14 +192,39 @@ def test_what_there_is_nothing_to_learn_from(work: Path, tmp_path: Path):
     assert not (tmp_path / "out").exists()
 
 
+def test_patches_are_learned_when_they_are_asked_for(work: Path):
+    config = replace(CONFIG, patched=False, training=OffsetTrainingConfig(epochs=1))
+    stage.run(open_work(work), work / OFFSETS, config)
+    opened = open_work(work)
+    found = find_offsets(work, opened.registered.garment, registration=opened.registered_digest)
+    assert found is not None
+    assert list(found.models) == ["decoder", "fully_connected", "fully_connected_pca"]
+    assert not (work / OFFSETS / "patches.safetensors").exists()
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_a_network_of_another_garment_is_refused(taken: Path, learned: Path, name: str):
+    garment = open_work(taken).registered.garment
+    mesh = garment.template
+    assert mesh.uv is not None
+    half = len(mesh.faces) // 2
+    fewer = replace(garment, template=replace(mesh, faces=mesh.faces[:half], uv=mesh.uv[:half]))
+    load_offset_model(learned / f"{name}.safetensors", garment)
+    if name == "decoder":
+        return  # images are of any garment; it is the registration's digest that tells
+    with pytest.raises(InputError, match="architecture|labels: expected"):
+        load_offset_model(learned / f"{name}.safetensors", fewer)
+
+
 def test_a_damaged_network_is_named(work: Path, learned: Path):
     shutil.copytree(learned, work / OFFSETS)
-    digest = open_work(work).registered_digest
+    opened = open_work(work)
+    digest, garment = opened.registered_digest, opened.registered.garment
     path = work / OFFSETS / "decoder.safetensors"
     path.write_bytes(path.read_bytes()[:-10])
     with pytest.raises(InputError, match=r"decoder\.safetensors: not a readable safetensors file"):
-        find_offsets(work, registration=digest)
+        find_offsets(work, garment, registration=digest)
     with pytest.raises(InputError, match="from this registration as it is now"):
-        find_offsets(work, registration="another")
+        find_offsets(work, garment, registration="another")
     shutil.rmtree(work / OFFSETS)
-    assert find_offsets(work, registration=digest) is None
+    assert find_offsets(work, garment, registration=digest) is None

@@ -20,7 +20,11 @@ from tests.unit.wrinkles.normal_maps.test_stages import SMALL
 from tests.unit.wrinkles.offset_images.test_stage import bound_work
 
 FRAMES = 8
-OFFSETS = ["--held-out", "0.2", "--texels", "32", "--training.epochs", "2", "--workers", "1"]
+OFFSETS = [
+    "--held-out", "0.2", "--texels", "32", "--training.epochs", "2", "--patched", "--patch.count", "2",
+    "--patch.texels", "32", "--patch.channels", "16", "--workers", "1",
+]  # fmt: skip
+NETWORKS = ["offset images", "offset images, patches", "fully connected", "fully connected, PCA"]
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +52,7 @@ def test_every_surface_has_a_row(compared: Path):
     result = json.loads((compared / "compare.json").read_text())
     rows = {row["name"]: row for row in result["methods"]}
     assert list(rows) == [
-        "registration", "blendshapes", "regression, linear", "network", "offset images", "fully connected, PCA",
+        "registration", "blendshapes", "regression, linear", "network", *NETWORKS,
     ]  # fmt: skip
     # a fifth of eight frames was held out of the training, and those are compared
     assert result["frames"] == [7, 8]
@@ -70,7 +74,7 @@ def test_the_page_stands_alone_and_shows_all(compared: Path):
     assert page.count("regression, linear *") == 1
     assert "learned from these very frames" in page
     assert "http" not in page.replace("https://www.w3.org", "")
-    assert page.count("<figure>") == 2 * (9 + 4 + 6) + 5  # the other four surfaces have a picture with the map too
+    assert page.count("<figure>") == 2 * (11 + 6 + 8) + 5  # the other six surfaces have a picture with the map too
     for name in ("scan", "network", "offset images", "blendshapes, network&#39;s map", "map of the scan"):
         assert f"<figcaption>{name}</figcaption>" in page
 
@@ -188,7 +192,7 @@ def test_offset_images_that_have_seen_the_frames_bear_an_asterisk(compared: Path
         main(["wrinkles", "offsets", str(work), *OFFSETS, "--held-out", "0"])
     assert again(work / "compare", compared.parents[1] / "model") == 0
     rows = json.loads((work / "compare" / "compare.json").read_text())["methods"]
-    assert [row["name"] for row in rows[-2:] if row["learned"]] == ["offset images", "fully connected, PCA"]
+    assert [row["name"] for row in rows[-4:] if row["learned"]] == NETWORKS
 
 
 def test_offset_images_that_are_not_finished_or_not_of_this_take(
