@@ -270,7 +270,7 @@ def _width(straight: np.ndarray, pieces: np.ndarray | None, spacing: float) -> f
     for piece in np.unique(pieces[pieces >= 0]):
         own = straight[pieces == piece]
         if len(own) >= MIN_PIECE * len(straight) and np.ptp(np.percentile(own, (20, 90))) < EVEN_BAND * spacing:
-            return float(full + 0.1 * spacing)
+            return float(full + 0.2 * spacing)
     return None
 
 
