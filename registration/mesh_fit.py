@@ -8,8 +8,8 @@ In this order, until the scan is reached:
                middle at first
 
 From there the template settles with its own shape and lengths (`settle`), limbs that turned about themselves on a way
-from afar are turned back (`untwisted`), and a vertex by vertex stage follows. What has open borders is tried as cloth
-besides, with lengths alone (`slid`).
+from afar are turned back (`untwisted`), and a vertex by vertex stage follows. What has two open borders or more is
+tried as cloth besides, with lengths alone (`slid`).
 
 Where `align` may, and a rigid motion brings the template far nearer, these are tried from there as well; from there
 alone if nothing of the scan lies near the start. Then:
@@ -81,6 +81,8 @@ PART_LOST = 0.01
 SETTLED = 0.006
 """Mean distance of what has settled from the scan, metres, beyond which its own shape keeps it from there: cloth that
 has folded, or grown. Then its shape is left to the scan, in these two stages."""
+OPENINGS = 2
+"""Border loops of a template from which it may be a garment, and is tried as cloth: others would pay for nothing."""
 STIFF = Schedule(12, (0.03, 0.012), smooth=(300.0, 3.0), stretch=(10.0, 0.03), boundary=(0.3, 0.05))
 """After the way from afar: what is smooth stays smooth, while limbs turn and slide into their places."""
 LOOSE = Schedule(8, (0.03, 0.012), smooth=(2.0, 0.2), stretch=(10.0, 0.03), boundary=(0.3, 0.05))
@@ -185,9 +187,14 @@ class _Attempts:
         tight = is_tight(assess(self.kept, scan, vertices, self.config.registration.quality))
         return tight and reaches(self.kept, scan, vertices, self.config.scan_fit, border_mm)
 
+    @property
+    def is_garment(self) -> bool:
+        """Whether the template has openings as garments have: a face has one, a person none."""
+        return len(self.kept.border.names) >= OPENINGS
+
     def is_cloth(self, vertices: np.ndarray, scan: FrameScan) -> bool:
-        """Whether a template with open borders does so with its lengths, on a scan without paint."""
-        bare = len(self.kept.border.vertices) > 0 and not len(scan.border_points)
+        """Whether a garment does so with its lengths, on a scan without paint."""
+        bare = self.is_garment and not len(scan.border_points)
         return bare and keeps_lengths(self.kept, vertices) and self.reaches(vertices, scan, CLOTH_BORDER_MM)
 
     @property
@@ -338,7 +345,7 @@ def _nearer_as_cloth(tried: _Attempts, shaped: np.ndarray, there: np.ndarray) ->
     """The template as it was shaped; or slid from where it came with its lengths, if it reaches the scan so, or lies
     nearer to it."""
     analysis, scan = tried.kept, tried.scan
-    if not len(analysis.border.vertices):
+    if not tried.is_garment:
         return shaped
     cloth = slid(analysis, scan, there, _dense_alone(tried.config.registration), tried.roughness)
     if tried.is_cloth(cloth, scan):
