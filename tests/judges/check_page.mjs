@@ -15,6 +15,7 @@ const context = await chromium.launchPersistentContext(mkdtempSync(join(tmpdir()
   args: ['--no-sandbox', '--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--ignore-gpu-blocklist', '--no-first-run', '--disable-background-networking', '--disable-component-update', '--disable-sync'],
 });
 const page = context.pages()[0] ?? await context.newPage();
+page.setDefaultTimeout(180_000); // a busy machine draws in software
 page.on('request', request => { if (!/^(file|blob|data):/.test(request.url())) requests.push(request.url()); });
 page.on('console', m => { if (['error', 'warning'].includes(m.type()) && !/GPU stall|GL Driver/.test(m.text())) messages.push(m.text()); });
 page.on('pageerror', error => messages.push(String(error)));
