@@ -27,7 +27,11 @@ def test_formats_join_what_is_there_and_nothing_is_written_twice(work: Path, cap
     exports = work / "exports"
     assert run("export", work, "--format", "pc2", "--quiet") == GOOD
     said = capsys.readouterr()
-    assert said.out == f"export: garment.pc2: 4 frames, read back within 0.0000 mm\nexports: {exports}\n"
+    assert said.out.splitlines() == [
+        "export: garment.pc2: 4 frames, read back within 0.0000 mm",
+        f"exports: {exports}",
+        f"for Blender: blender -P {exports / 'open_in_blender.py'}",
+    ]
     assert said.err == ""
     before = {path: path.stat().st_mtime_ns for path in exports.rglob("*") if path.suffix in (".pc2", ".png", ".obj")}
     assert len(before) == 6
