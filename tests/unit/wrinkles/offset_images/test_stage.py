@@ -212,7 +212,7 @@ def test_a_network_of_another_garment_is_refused(taken: Path, learned: Path, nam
     load_offset_model(learned / f"{name}.safetensors", garment)
     if name == "decoder":
         return  # images are of any garment; it is the registration's digest that tells
-    with pytest.raises(InputError, match="architecture|labels: expected"):
+    with pytest.raises(InputError, match=r"architecture|labels: expected"):
         load_offset_model(learned / f"{name}.safetensors", fewer)
 
 
