@@ -190,7 +190,8 @@ def train_offsets(network: nn.Module, lesson: OffsetLesson, config: OffsetTraini
     """Train a decoder or a baseline in place, keep its best epoch; the validation error of every epoch, cm.
 
     The baseline without PCA minimises the mean length of the difference of offsets, that with PCA the mean over frames
-    of the length of the difference of all coefficients; decoders the grid loss, and with a weight each the losses of normals and of edge lengths.
+    of the length of the difference of all coefficients; decoders the grid loss, and with a weight each the losses of
+    normals and of edge lengths.
     """
     training = start_training(network, lesson, config)
     while not training.is_over(config):
