@@ -78,7 +78,7 @@ PAPER: Mapping[str, tuple[float, float]] = {
 }
 SINGLE = ("decoder", "decoder_l1", "decoder_l2", "patches", "direct", "pca")
 """Networks that answer alone, in local offsets."""
-CLIPS, PATH = ("kernels", "direct_with_kernels", "decoder"), 4
+CLIPS, PATH = ("direct_with_kernels", "decoder"), 3
 """Models whose motions are measured, and on how many poses one after the other."""
 
 

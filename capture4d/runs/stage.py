@@ -51,7 +51,7 @@ FORMER_STAGES = {former: name for name, former in FORMER_NAMES.items()}
 
 SCHEMAS = {
     "animate": 2, "calibrate": 1, "compare": 6, "export": 1, "export-onnx": 1, "extract": 6, "fit": 7, "fit-styles": 1,
-    "import": 1, "offsets train": 2, "register": 6, "report": 4, "scan": 2, "synth": 3,
+    "import": 1, "offsets train": 3, "register": 6, "report": 4, "scan": 2, "synth": 3,
     "synth-board": 1, "synth-drapes": 4, "synth-styles": 3, "texture": 1, "track": 7, "training-set": 1,
     "wrinkles apply": 2, "wrinkles maps": 1, "wrinkles offsets": 3, "wrinkles train": 1,
 }  # fmt: skip

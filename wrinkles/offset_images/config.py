@@ -50,8 +50,8 @@ class OffsetTrainingConfig:
     norm: Literal["l1", "l2", "l2_squared"] = "l2"
     """Of the three channels of a texel, in the grid loss."""
     normal_weight: NonNegative = 5.0
-    """Weight of the normals' loss, beside 1 of the offsets', which are centimetres. The paper's 0.01 bites beside
-    metres alone: 1 here."""
+    """Weight of the normals' loss, beside 1 of the offsets', which are centimetres. The paper's 0.01, of lengths in
+    metres, is 1 here."""
     edge_weight: NonNegative = 0.0
     """Weight of the edge lengths' loss, which neckties need."""
     patience: Count = 12

@@ -110,8 +110,8 @@ class FullyConnected(nn.Module):
 class PcaFullyConnected(nn.Module):
     """The baseline with PCA: pose to coefficients of the offsets' principal components.
 
-    It learns the coefficients themselves, all in units of the first one's standard deviation: a squared error of
-    coefficients is then one of offsets.
+    It learns the coefficients themselves, all in units of the first one's standard deviation: the length of an
+    error of coefficients is then that of one of offsets.
     """
 
     mean: Tensor

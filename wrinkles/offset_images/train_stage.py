@@ -54,7 +54,7 @@ from wrinkles.offset_images.training import OffsetLesson, start_training
 
 __all__ = ["ERRORS", "run"]
 
-STAGE, SCHEMA = "offsets train", 2
+STAGE, SCHEMA = "offsets train", 3
 ERRORS = "errors.json"
 COMMAND = "capture4d offsets train DRAPES --output MODEL"
 DRAPES = "synth-drapes"

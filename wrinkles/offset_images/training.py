@@ -168,7 +168,7 @@ def _loss(training: OffsetTraining, rows: Int[Tensor, " B"], config: OffsetTrain
     network, canvas, frames = training.network, training.canvas, training.lesson.train
     pose, targets = frames.pose[rows], training.targets[rows]
     if isinstance(network, PcaFullyConnected):
-        return (network.layers(pose) - targets).square().sum(dim=-1).mean()
+        return (network.layers(pose) - targets).norm(dim=-1).mean()
     if canvas is None:
         return (network(pose) - targets).norm(dim=-1).mean()
     with torch.autocast("cpu", torch.bfloat16, enabled=config.half_precision):
@@ -189,8 +189,9 @@ def _loss(training: OffsetTraining, rows: Int[Tensor, " B"], config: OffsetTrain
 def train_offsets(network: nn.Module, lesson: OffsetLesson, config: OffsetTrainingConfig) -> list[float]:
     """Train a decoder or a baseline in place, keep its best epoch; the validation error of every epoch, cm.
 
-    The baseline without PCA minimises the mean length of the difference of offsets, that with PCA squared differences
-    of coefficients; decoders the grid loss, and with a weight each the losses of normals and of edge lengths.
+    The baseline without PCA minimises the mean length of the difference of offsets, that with PCA the mean over frames
+    of the length of the difference of all coefficients; decoders the grid loss, and with a weight each the losses of
+    normals and of edge lengths.
     """
     training = start_training(network, lesson, config)
     while not training.is_over(config):
