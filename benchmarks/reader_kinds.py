@@ -274,7 +274,9 @@ def _moving_glb(path: Path) -> None:
     """One target, seen whole in the second frame."""
     shape, times = MESH.vertices, np.array([0, 0.02], np.float32)
     weights, clock = np.array([[0], [1]], np.float32), {"fps": 50.0, "first_frame": 3}
-    targets = SceneTargets(shape, 0 * shape + np.float32([0, 0, 1]), 0.1 * shape[None], 0 * shape[None], weights, ["a"])
+    targets = SceneTargets(
+        shape, 0 * shape + np.array([0, 0, 1], np.float32), 0.1 * shape[None], 0 * shape[None], weights, ["a"]
+    )
     write_animated_glb(path, AnimatedScene(MESH, times, targets, scene_extras=clock))
 
 

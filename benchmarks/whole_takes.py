@@ -142,8 +142,8 @@ def _registered(name: str, folder: Path, workers: int) -> _Take:
         )
         for frame_id in capture.frame_ids
     ]
-    numbers = np.array([row[:-1] for row in rows], dtype=float).T
-    return _Take(name, *numbers, up, np.array([row[-1] for row in rows]))
+    mean, p95, beyond, cut, unfitted = np.array([row[:-1] for row in rows], dtype=float).T
+    return _Take(name, mean, p95, beyond, cut, unfitted, up, np.array([row[-1] for row in rows]))
 
 
 def _frame(

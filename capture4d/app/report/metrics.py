@@ -151,10 +151,9 @@ def truth_measures(
     garment = registered.garment
     vertices = np.asarray(registered.vertices[row])
     mesh, truth = garment.template.with_vertices(vertices), model.fine.with_vertices(truth_vertices)
-    if covered is None:
-        covered = np.isfinite(registered.residual_m[row])
+    seen = np.isfinite(registered.residual_m[row]) if covered is None else covered
     away, back = truth_distances(mesh, truth)
-    there, hidden = away[covered], away[~covered]
+    there, hidden = away[seen], away[~seen]
     places = material_points(truth_vertices, truth.faces, model.template_faces, model.template_barycentric)
     border = border_errors(
         {name: vertices[loop] for name, loop in garment.loops.items()},
