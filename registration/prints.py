@@ -112,7 +112,6 @@ def learn_print(
                 break
     if not contrast >= CONTRAST:
         return (), contrast
-    found = found[1:] or found  # the first one, from afar, is off by more than those that start from it
     chosen = np.unique(np.linspace(0, len(found) - 1, min(AVERAGED, len(found))).round().astype(int))
     frames = [found[row] for row in chosen]
     cloth = _average(analysis, samples, frames, None, reaches)

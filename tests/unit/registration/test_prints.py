@@ -193,14 +193,3 @@ def test_a_print_is_learned_where_the_body_stands_as_in_the_first_frame(template
     assert kept == [*range(0, len(kept) * 3, 3)]
     assert 3 < len(kept) < 20
     assert still_positions(lambda position: (1 + position) * template.rest, range(10)) == [0, 1, 2]
-
-
-def test_the_first_frame_from_afar_is_not_learned_from_where_others_follow(template, config) -> None:
-    def load(frame_id: int) -> GarmentScan:
-        return replace(scan_of(blobs if frame_id > 1 else stripes), frame_id=frame_id)
-
-    later, _ = learn_print(template, None, [0, 1, 2], [1, 2, 3], load=load, config=config)
-    alone, _ = learn_print(template, None, [0], [2], load=load, config=config)
-    inked = later[-1].known & alone[-1].known
-    difference = (later[-1].values - alone[-1].values)[inked]
-    assert np.abs(difference - difference.mean(axis=0)).mean() < 0.2 * alone[-1].values[inked].std()
