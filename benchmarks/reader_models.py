@@ -115,18 +115,20 @@ def _read_generator(path: Path) -> Any:
 
 
 def _write_offsets(path: Path, *, baseline: bool) -> None:
+    from wrinkles.offset_images.layout import OffsetLayout
     from wrinkles.offset_images.model_files import OffsetModel, save_offset_model
     from wrinkles.offset_images.networks import PcaFullyConnected, image_decoder
 
-    joints = np.array([1, 2])
-    network = PcaFullyConnected(18, 3, components=2, hidden=256) if baseline else image_decoder(18, 16)
-    save_offset_model(path, OffsetModel(network, joints, 16, [{"epoch": 1, "loss": 0.5}]))
+    joints, layout = np.array([1, 2]), OffsetLayout.create(GARMENT, 16)
+    pixels = len(layout.vertex)
+    network = PcaFullyConnected(18, pixels, components=2, hidden=256) if baseline else image_decoder(18, 16)
+    save_offset_model(path, OffsetModel(network, joints, layout, [{"epoch": 1, "loss": 0.5}]))
 
 
 def _read_offsets(path: Path) -> Any:
     from wrinkles.offset_images.model_files import load_offset_model
 
-    return load_offset_model(path)
+    return load_offset_model(path, GARMENT)
 
 
 def _write_styles(path: Path, *, method: str) -> None:

@@ -245,14 +245,12 @@ def folded(config: SynthConfig) -> SynthConfig:
 
 _FULL = SynthConfig(name="tshirt-200k")
 PRESETS: dict[str, SynthConfig] = {
-    "demo": folded(
-        replace(
-            _FULL,
-            name="demo",
-            frames=36,
-            capture_every=3,
-            simulation=SimulationConfig(calm_frames=14, approach_frames=16, rest_frames=8),
-        )
+    "demo": replace(
+        _FULL,
+        name="demo",
+        frames=36,
+        capture_every=3,
+        simulation=SimulationConfig(calm_frames=14, approach_frames=16, rest_frames=8),
     ),
     "tiny": replace(
         _FULL,
@@ -278,12 +276,17 @@ PRESETS: dict[str, SynthConfig] = {
         ),
     ),
     # There and back: the clip ends in the pose it began with, so that drift can be told from the pose.
-    "tshirt-200k": folded(replace(_FULL, frames=212)),
-    "tshirt-cotton-200k": folded(replace(_FULL, name="tshirt-cotton-200k", fabric="shirt-cotton", seed=1)),
-    "tshirt-linen-200k": folded(replace(_FULL, name="tshirt-linen-200k", fabric="linen", seed=2)),
+    "tshirt-200k": replace(_FULL, frames=212),
+    "tshirt-cotton-200k": replace(_FULL, name="tshirt-cotton-200k", fabric="shirt-cotton", seed=1),
+    "tshirt-linen-200k": replace(_FULL, name="tshirt-linen-200k", fabric="linen", seed=2),
+    "tshirt-folds-200k": folded(replace(_FULL, name="tshirt-folds-200k", frames=212)),
 }
-"""Takes by name, from minutes to an hour. The large T-shirts fold here and there; the small ones, and the training
-sets, which were learned from before, everywhere alike."""
+"""Takes by name, from minutes to an hour."""
+FOLDS_BY_DEFAULT: bool = False
+"""Whether the T-shirts among the presets fold here and there; ROADMAP.md lists what has to be measured again first."""
+if FOLDS_BY_DEFAULT:
+    SHIRTS = ("demo", "tshirt-200k", "tshirt-cotton-200k", "tshirt-linen-200k")
+    PRESETS |= {name: folded(PRESETS[name]) for name in SHIRTS}
 
 
 def _at_waist(simulation: SimulationConfig, hold_hz: float) -> SimulationConfig:
@@ -379,7 +382,7 @@ def _clips(base: SynthConfig, clips: dict[str, MotionConfig]) -> dict[str, Synth
     }
 
 
-_TRAIN = replace(_FULL, name="tshirt-train", frames=150)
+_TRAIN = replace(PRESETS["tshirt-200k"], name="tshirt-train", frames=150)
 _TINY_TRAIN = replace(
     PRESETS["tiny"],
     name="tiny-train",

@@ -175,9 +175,9 @@ class DenseConfig:
 
     cold: Schedule = Schedule(12, (0.03, 0.012), smooth=(0.05, 0.02), stretch=(10.0, 0.03), boundary=(0.3, 0.05))
     """After a cold coarse stage."""
-    warm: Schedule = Schedule(3, (0.02, 0.012), smooth=(3.0, 0.2), stretch=(10.0, 1.0), boundary=(0.2, 0.1))
+    warm: Schedule = Schedule(3, (0.02, 0.012), smooth=(3.0, 0.2), stretch=(10.0, 0.05), boundary=(0.2, 0.1))
     """After a warm coarse stage. Bending is stiff at first: softer, what is nearest pulls cloth along itself, frame by
-    frame. Lengths are held to the end: what slides without a trace is told by nothing else."""
+    frame."""
     plasticity: Share = 0.5
     """Share of the bending that is forgiven between steps: 0 keeps the coarse stage's shape, 1 only damps change."""
     compression: NonNegative = 1.0
@@ -192,9 +192,8 @@ class SequenceConfig:
     """How a take is cut up and where each frame starts."""
 
     segment: Count = 240
-    """Frames of a segment, more or less a quarter: it is begun where the pose is nearest to that of the template, for
-    it knows nothing of how the cloth has slid before. Segments are registered side by side, on as many processes and
-    machines as there are, and joined."""
+    """Frames of a segment, more or less a quarter: it begins where the pose is nearest to that of the template.
+    Segments are registered side by side, on as many processes and machines as there are, and joined."""
     overlap: Whole = 24
     """Frames before its first one from which a segment is registered, starting from the skinned template. In the last
     two thirds of them the segment before fades into it."""

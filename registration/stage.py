@@ -55,7 +55,7 @@ from registration.template import TemplateAnalysis, analyse_template
 
 __all__ = ["changes", "run"]
 
-SCHEMA = 5
+SCHEMA = 6
 
 
 def run(
