@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.reader_values import BODY, GARMENT, MESH, NAMES, PARENTS, RNG
-from capture4d.types import Mesh
+from capture4d.types import Garment, Mesh
 
 __all__ = ["MODELS"]
 
@@ -114,21 +114,28 @@ def _read_generator(path: Path) -> Any:
     return load_model(path)
 
 
+def _garment_of_islands() -> Garment:
+    """With UVs in which a face is an island of three pixels."""
+    apart = np.arange(3, dtype=np.float32)[:, None, None] / 3
+    uv = apart + np.array([[0, 0], [0.25, 0], [0, 0.25]], np.float32)
+    return replace(GARMENT, template=Mesh(MESH.vertices, MESH.faces, uv))
+
+
 def _write_offsets(path: Path, *, baseline: bool) -> None:
     from wrinkles.offset_images.layout import OffsetLayout
     from wrinkles.offset_images.model_files import OffsetModel, save_offset_model
     from wrinkles.offset_images.networks import PcaFullyConnected, image_decoder
 
-    joints, layout = np.array([1, 2]), OffsetLayout.create(GARMENT, 16)
+    joints, layout = np.array([1, 2]), OffsetLayout.create(_garment_of_islands(), 64)
     pixels = len(layout.vertex)
-    network = PcaFullyConnected(18, pixels, components=2, hidden=256) if baseline else image_decoder(18, 16)
+    network = PcaFullyConnected(18, pixels, components=2, hidden=256) if baseline else image_decoder(18, 64)
     save_offset_model(path, OffsetModel(network, joints, layout, [{"epoch": 1, "loss": 0.5}]))
 
 
 def _read_offsets(path: Path) -> Any:
     from wrinkles.offset_images.model_files import load_offset_model
 
-    return load_offset_model(path, GARMENT)
+    return load_offset_model(path, _garment_of_islands())
 
 
 def _write_styles(path: Path, *, method: str) -> None:
@@ -170,9 +177,7 @@ def _write_drape_offsets(path: Path) -> None:
     from wrinkles.offset_images.drape_model import ModelParts, save_model_parts
     from wrinkles.offset_images.kernels import PoseKernels
 
-    apart = np.arange(3, dtype=np.float32)[:, None, None] / 3  # a face is an island of three pixels
-    uv = apart + np.array([[0, 0], [0.25, 0], [0, 0.25]], np.float32)
-    garment = replace(GARMENT, template=Mesh(MESH.vertices, MESH.faces, uv))
+    garment = _garment_of_islands()
     poses, dual, mean, components = (RNG.random(size, np.float32) for size in ((4, 18), (4, 2), (27,), (2, 27)))
     kernels = PoseKernels(poses, dual, mean, components, 1.0, 0.1)
     config = DrapeOffsetsConfig(network="kernels", texels=64)
