@@ -231,8 +231,7 @@ class SynthConfig:
 
 
 def folded(config: SynthConfig) -> SynthConfig:
-    """The same take in a garment that folds here and there: its sheet is coarser, for there are two meshes over it, and
-    hangs more freely below the chest; a waistband keeps its hold."""
+    """The same take in a garment that folds here and there, on a coarser sheet that, but for a waistband, hangs freely."""
     if config.folds is not None:
         return config
     simulation, folds = config.simulation, FoldConfig()
