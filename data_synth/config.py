@@ -231,7 +231,7 @@ class SynthConfig:
 
 
 def folded(config: SynthConfig) -> SynthConfig:
-    """The same take in a garment that folds here and there, on a coarser sheet that, but for a waistband, hangs freely."""
+    """The same take in a garment that folds here and there, on a coarser sheet that hangs freely from its hold."""
     if config.folds is not None:
         return config
     simulation, folds = config.simulation, FoldConfig()
