@@ -27,6 +27,7 @@ from rich.console import Console
 from benchmarks.fold_statistics import fold_statistics, legs, torso
 from benchmarks.metric import Metric
 from benchmarks.scan_errors import scan_errors
+from capture4d.body.skinning import PosedBody, ShapedBody
 from capture4d.geometry.mesh import vertex_normals
 from capture4d.geometry.triangles import count_intersecting_faces
 from capture4d.runs.workers import run_jobs
@@ -193,7 +194,9 @@ def _measure(job: _Job) -> tuple[SynthConfig, dict[str, float]]:
         measure_cloth(take.fine, take.wrinkles, fine, take.bodies[take.lead + index].vertices(), faces)
         for index, _, fine in clip
     ]
-    overhead = np.array([_arms_up(take, index) > OVERHEAD_COSINE for index, _, _ in clip])
+    overhead = np.array(
+        [arms_up(take.shaped, take.bodies[take.lead + index]) > OVERHEAD_COSINE for index, _, _ in clip]
+    )
     stretch = np.array([quality.stretch_p99 for quality in qualities])
     inside = np.array([quality.inside_body_percent for quality in qualities])
     row = {
@@ -247,15 +250,14 @@ def _wrinkles(take: TakePlan, clip: list) -> tuple[np.ndarray, np.ndarray, dict[
     return np.array(residuals), np.array(changes), normals
 
 
-def _arms_up(take: TakePlan, index: int) -> float:
+def arms_up(shaped: ShapedBody, posed: PosedBody) -> float:
     """How steeply the higher upper arm points up: 1 is overhead, 0 level, -1 hanging."""
-    body = take.bodies[take.lead + index]
-    names, joints = take.shaped.body.joint_names, take.shaped.joints
+    names, joints = shaped.body.joint_names, shaped.joints
     up = []
     for side in "LR":
         shoulder, elbow = names.index(f"upperarm01.{side}"), names.index(f"lowerarm01.{side}")
-        arm = body.transforms[shoulder, :3, :3] @ (joints[elbow] - joints[shoulder])
-        up.append(arm[1] / np.linalg.norm(arm))
+        arm = posed.transforms[shoulder, :3, :3] @ (joints[elbow] - joints[shoulder])
+        up.append(float(arm[1] / np.linalg.norm(arm)))
     return max(up)
 
 
@@ -282,7 +284,7 @@ def _folds(take: TakePlan, clip: list) -> dict[str, float]:
 
 def _poses(take: TakePlan, clip: list) -> dict[str, int]:
     """Where in a clip the arms are in each of `POSES`."""
-    up = np.array([_arms_up(take, index) for index, _, _ in clip])
+    up = np.array([arms_up(take.shaped, take.bodies[take.lead + index]) for index, _, _ in clip])
     hanging = int(np.argmin(up))
     overhead = hanging + int(np.argmax(up[hanging:]))
     level = hanging + int(np.argmin(np.abs(up[hanging : overhead + 1])))

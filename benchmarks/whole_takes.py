@@ -32,14 +32,15 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.learning_takes import true_places
 from benchmarks.metric import Metric
 from benchmarks.printed_takes import plain_scans, printed_take, subjects
 from benchmarks.renewal import renew
+from benchmarks.synthesis import arms_up
 from capture4d.body.skinning import pose_frame, with_shape
 from capture4d.captures.capture import Capture, read_capture
-from capture4d.captures.evaluation import correspondence_errors, drift_ratio, material_points
+from capture4d.captures.evaluation import correspondence_errors, drift_ratio
 from capture4d.captures.garment_scans import load_garment_scan
-from capture4d.captures.truth import read_truth_model, read_truth_vertices
 from capture4d.extraction.stage import ExtractionSettings
 from capture4d.extraction.stage import run as extract
 from capture4d.files.atomic import read_json
@@ -125,30 +126,13 @@ def _registered(name: str, folder: Path, workers: int) -> _Take:
     renew(partial(extract, capture, work / "garment", ExtractionSettings(), workers=workers))
     uncoloured = RegistrationConfig(colour=replace(RegistrationConfig().colour, use="off"))
     renew(partial(register, capture, work / "garment", work / "off", uncoloured))
-    model = read_truth_model(capture)
-    assert model is not None, "these takes come with their truth"
-    up = _arms_up(capture)
-    rows = [
-        _frame(
-            capture,
-            frame_id,
-            work,
-            material_points(
-                read_truth_vertices(capture, frame_id),
-                model.fine.faces,
-                model.template_faces,
-                model.template_barycentric,
-            ),
-        )
-        for frame_id in capture.frame_ids
-    ]
+    up, places = _arms_up(capture), true_places(capture)
+    rows = [_frame(frame_id, work, there) for frame_id, there in zip(capture.frame_ids, places, strict=True)]
     mean, p95, beyond, cut, unfitted = np.array([row[:-1] for row in rows], dtype=float).T
     return _Take(name, mean, p95, beyond, cut, unfitted, up, np.array([row[-1] for row in rows]))
 
 
-def _frame(
-    capture: Capture, frame_id: int, work: Path, places: np.ndarray
-) -> tuple[float, float, float, float, float, str]:
+def _frame(frame_id: int, work: Path, places: np.ndarray) -> tuple[float, float, float, float, float, str]:
     record = read_json(work / "off" / "metrics" / f"{frame_id:06d}.json")
     with np.load(work / "off" / "frames" / f"{frame_id:06d}.npz") as arrays:
         vertices, residual = arrays["vertices"], arrays["residual_m"]
@@ -171,14 +155,8 @@ def _arms_up(capture: Capture) -> np.ndarray:
     assert capture.body is not None
     assert capture.poses is not None
     shaped = with_shape(capture.body, capture.poses.shape)
-    names = capture.body.joint_names
-    ends = [(names.index(f"upperarm01.{side}"), names.index(f"lowerarm01.{side}")) for side in "LR"]
-    up = []
-    for row in range(len(capture.frame_ids)):
-        pose = pose_frame(shaped, capture.poses, row)
-        arms = [pose.transforms[upper, :3, :3] @ (shaped.joints[lower] - shaped.joints[upper]) for upper, lower in ends]
-        up.append(max(arm[1] / np.linalg.norm(arm) for arm in arms))
-    return np.array(up)
+    rows = range(len(capture.frame_ids))
+    return np.array([arms_up(shaped, pose_frame(shaped, capture.poses, row)) for row in rows])
 
 
 def _print(takes: list[_Take]) -> None:
