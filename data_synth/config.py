@@ -243,49 +243,43 @@ def folded(config: SynthConfig) -> SynthConfig:
 
 
 _FULL = SynthConfig(name="tshirt-200k")
-PRESETS: dict[str, SynthConfig] = {
-    "demo": replace(
+_TINY = replace(
+    _FULL,
+    name="tiny",
+    frames=6,
+    capture_every=4,
+    template_vertices=1500,
+    simulation=SimulationConfig(
+        vertices=1600,
+        substeps=12,
+        iterations=3,
+        contact_substeps=2,
+        damping=0.97,
+        calm_frames=18,
+        approach_frames=16,
+        rest_frames=8,
+    ),
+    relaxation=RelaxationConfig(vertices=12_000, sweeps=40),
+    scanner=ScannerConfig(
+        stereo=StereoConfig(pods=10, image_size=384, supersampling=1, speckle_window_px=60),
+        rig=RigConfig(cameras=24, image_size=320),
+        fusion=FusionConfig(garment_voxel_m=0.005, body_voxel_m=0.009, min_component_faces=120),
+    ),
+)
+_SHIRTS: tuple[SynthConfig, ...] = (
+    replace(
         _FULL,
         name="demo",
         frames=36,
         capture_every=3,
         simulation=SimulationConfig(calm_frames=14, approach_frames=16, rest_frames=8),
     ),
-    "tiny": replace(
-        _FULL,
-        name="tiny",
-        frames=6,
-        capture_every=4,
-        template_vertices=1500,
-        simulation=SimulationConfig(
-            vertices=1600,
-            substeps=12,
-            iterations=3,
-            contact_substeps=2,
-            damping=0.97,
-            calm_frames=18,
-            approach_frames=16,
-            rest_frames=8,
-        ),
-        relaxation=RelaxationConfig(vertices=12_000, sweeps=40),
-        scanner=ScannerConfig(
-            stereo=StereoConfig(pods=10, image_size=384, supersampling=1, speckle_window_px=60),
-            rig=RigConfig(cameras=24, image_size=320),
-            fusion=FusionConfig(garment_voxel_m=0.005, body_voxel_m=0.009, min_component_faces=120),
-        ),
-    ),
+    _TINY,
     # There and back: the clip ends in the pose it began with, so that drift can be told from the pose.
-    "tshirt-200k": replace(_FULL, frames=212),
-    "tshirt-cotton-200k": replace(_FULL, name="tshirt-cotton-200k", fabric="shirt-cotton", seed=1),
-    "tshirt-linen-200k": replace(_FULL, name="tshirt-linen-200k", fabric="linen", seed=2),
-    "tshirt-folds-200k": folded(replace(_FULL, name="tshirt-folds-200k", frames=212)),
-}
-"""Takes by name, from minutes to an hour."""
-FOLDS_BY_DEFAULT: bool = False
-"""Whether the T-shirts among the presets fold here and there; ROADMAP.md lists what has to be measured again first."""
-if FOLDS_BY_DEFAULT:
-    SHIRTS = ("demo", "tshirt-200k", "tshirt-cotton-200k", "tshirt-linen-200k")
-    PRESETS |= {name: folded(PRESETS[name]) for name in SHIRTS}
+    replace(_FULL, frames=212),
+    replace(_FULL, name="tshirt-cotton-200k", fabric="shirt-cotton", seed=1),
+    replace(_FULL, name="tshirt-linen-200k", fabric="linen", seed=2),
+)
 
 
 def _at_waist(simulation: SimulationConfig, hold_hz: float) -> SimulationConfig:
@@ -293,12 +287,9 @@ def _at_waist(simulation: SimulationConfig, hold_hz: float) -> SimulationConfig:
     return replace(simulation, hold_hz=hold_hz, hold_depth_m=0.04, hold_floor=0.02, hold_ripple_m=0.0)
 
 
-_PLAIN_SHEET = SimulationConfig(vertices=2500, substeps=32)
-"""Of a long garment: half the vertices and two thirds of the steps of a T-shirt's, 116 CPU s for the first 60 frames of
-trousers, fine folds included."""
 _WHOLE_PERSON = ScannerConfig(rig=RigConfig(image_size=800))
 """Cameras stand farther away where the whole person is in view, and need more pixels."""
-_SHIRT = replace(_FULL, name="shirt-200k", garment="shirt", fabric="shirt-cotton", frames=212, simulation=_PLAIN_SHEET)
+_SHIRT = replace(_FULL, name="shirt-200k", garment="shirt", fabric="shirt-cotton", frames=212)
 _TROUSERS = replace(
     _FULL,
     name="trousers-200k",
@@ -307,7 +298,7 @@ _TROUSERS = replace(
     fabric="twill",
     frames=186,
     motion=MotionConfig("range-of-legs"),
-    simulation=_at_waist(_PLAIN_SHEET, 120.0),
+    simulation=_at_waist(SimulationConfig(), 120.0),
     scanner=_WHOLE_PERSON,
 )
 _SKIRT = replace(_TROUSERS, name="skirt-200k", garment="skirt", cut=None, fabric="shirt-cotton")
@@ -315,33 +306,34 @@ _SKIRT = replace(_TROUSERS, name="skirt-200k", garment="skirt", cut=None, fabric
 
 def _small(full: SynthConfig, name: str, motion: ClipName) -> SynthConfig:
     """The same garment as coarse as the preset `tiny`, in the first second of a clip."""
-    tiny = PRESETS["tiny"]
-    coarse = replace(tiny.simulation, vertices=1200, calm_frames=14, approach_frames=8, rest_frames=4)
+    coarse = replace(_TINY.simulation, vertices=1600, calm_frames=14, approach_frames=8, rest_frames=4)
     return replace(
         full,
         name=name,
         frames=14,
         capture_every=4,
-        template_vertices=tiny.template_vertices,
+        template_vertices=_TINY.template_vertices,
         motion=MotionConfig(motion),
         simulation=coarse if full.garment == "shirt" else _at_waist(coarse, 80.0),
-        relaxation=tiny.relaxation,
+        relaxation=_TINY.relaxation,
         scanner=replace(
-            tiny.scanner,
+            _TINY.scanner,
             rig=RigConfig(cameras=32, image_size=400 if full.garment == "shirt" else 600),
-            fusion=replace(tiny.scanner.fusion, body_voxel_m=0.007, min_component_faces=60),
+            fusion=replace(_TINY.scanner.fusion, body_voxel_m=0.007, min_component_faces=60),
         ),
     )
 
 
-PRESETS |= {
-    "shirt-200k": _SHIRT,
-    "trousers-200k": _TROUSERS,
-    "skirt-200k": _SKIRT,
-    "shirt-demo": _small(_SHIRT, "shirt-demo", "reach"),
-    "trousers-demo": _small(_TROUSERS, "trousers-demo", "squat"),
-    "skirt-demo": _small(_SKIRT, "skirt-demo", "lunge"),
-}
+_OTHERS: tuple[SynthConfig, ...] = (
+    _SHIRT,
+    _TROUSERS,
+    _SKIRT,
+    _small(_SHIRT, "shirt-demo", "reach"),
+    _small(_TROUSERS, "trousers-demo", "squat"),
+    _small(_SKIRT, "skirt-demo", "lunge"),
+)
+PRESETS: dict[str, SynthConfig] = {take.name: folded(take) for take in (*_SHIRTS, *_OTHERS)}
+"""Takes by name, from minutes to an hour."""
 
 
 @settings
@@ -382,14 +374,16 @@ def _clips(base: SynthConfig, clips: dict[str, MotionConfig]) -> dict[str, Synth
 
 
 _TRAIN = replace(PRESETS["tshirt-200k"], name="tshirt-train", frames=150)
-_TINY_TRAIN = replace(
-    PRESETS["tiny"],
-    name="tiny-train",
-    frames=16,
-    capture_every=2,
-    template_vertices=700,
-    simulation=replace(PRESETS["tiny"].simulation, vertices=900, calm_frames=12, approach_frames=10, rest_frames=4),
-    relaxation=RelaxationConfig(vertices=4_000, sweeps=20),
+_TINY_TRAIN = folded(
+    replace(
+        _TINY,
+        name="tiny-train",
+        frames=16,
+        capture_every=2,
+        template_vertices=700,
+        simulation=replace(_TINY.simulation, vertices=1200, calm_frames=12, approach_frames=10, rest_frames=4),
+        relaxation=RelaxationConfig(vertices=4_000, sweeps=20),
+    )
 )
 TRAINING_SETS: dict[str, TrainingSetConfig] = {
     "tshirt-train": TrainingSetConfig(
