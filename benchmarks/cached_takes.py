@@ -46,8 +46,8 @@ def one_maker(folder: Path) -> Iterator[None]:
 
 def _folder(config: SynthConfig | TrainingSetConfig, schema: int) -> Path:
     known = json.dumps([schema, asdict(config)], sort_keys=True)
-    # Takes were made, and are kept, before there were prints, other garments, and folds here and there.
-    for later in ("print", "print_mm", "garment", "cut", "skirt_weights", "folds"):
+    # Takes were made, and are kept, before there were prints and other garments.
+    for later in ("print", "print_mm", "garment", "cut", "skirt_weights"):
         known = known.replace(f', "{later}": null', "")
     key = hashlib.sha256(known.encode()).hexdigest()[:12]
     return user_cache_folder() / "takes" / f"{config.name}-{key}"

@@ -175,7 +175,7 @@ class DenseConfig:
 
     cold: Schedule = Schedule(12, (0.03, 0.012), smooth=(0.05, 0.02), stretch=(10.0, 0.03), boundary=(0.3, 0.05))
     """After a cold coarse stage."""
-    warm: Schedule = Schedule(3, (0.02, 0.012), smooth=(3.0, 0.2), stretch=(10.0, 0.05), boundary=(0.2, 0.1))
+    warm: Schedule = Schedule(3, (0.02, 0.012), smooth=(3.0, 0.2), stretch=(10.0, 1.0), boundary=(0.2, 0.1))
     """After a warm coarse stage. Bending is stiff at first: softer, what is nearest pulls cloth along itself, frame by
     frame."""
     plasticity: Share = 0.5
