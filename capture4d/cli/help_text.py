@@ -31,7 +31,7 @@ _GROUPS: Mapping[str, Sequence[str]] = {
     "two meshes:": ("register-mesh",),
     "rigs:": ("calibrate", "check-rig", "convert-rig", "synth-board"),
     "captures that nobody filmed:": ("demo", "synth", "scan", "synth-drapes"),
-    "files and this installation:": ("convert-body", "convert-poses", "doctor"),
+    "files and this installation:": ("convert-body", "convert-poses", "doctor", "cache"),
 }  # fmt: skip
 
 EXAMPLES: Mapping[str, Sequence[str]] = {
@@ -101,6 +101,7 @@ EXAMPLES: Mapping[str, Sequence[str]] = {
     "convert-rig": ("convert-rig sparse --output rig.json --scale 0.01",),
     "convert-poses": ("convert-poses walk.bvh poses.npz --up z",),
     "doctor": ("doctor", "doctor --json"),
+    "cache": ("cache", "cache --remove old --dry-run", "cache --remove old", "cache --remove printed"),
 }
 """Lines that work, where the files are there, without the `capture4d` before them."""
 

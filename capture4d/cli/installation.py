@@ -156,13 +156,14 @@ def as_text(diagnosis: Diagnosis) -> str:
     memory = "unknown" if machine.memory_gb is None else f"{machine.memory_gb:.1f} GB"
     free = "unknown" if machine.free_memory_gb is None else f"{machine.free_memory_gb:.1f} GB"
     disk = "unknown" if cache.free_disk_gb is None else f"{cache.free_disk_gb:.1f} GB"
+    told = "writable; capture4d cache names what it keeps"
     rows = [
         ("capture4d", f"{diagnosis.version or 'not installed'} in {diagnosis.folder}"),
         ("Python", f"{machine.python}, {machine.executable}"),
         ("system", machine.system),
         ("machine", f"{machine.cores} cores, {memory} of memory, {free} of it free"),
         ("threads", threads),
-        ("cache", f"{cache.folder}: {cache.mb:.0f} MB, {disk} free, {cache.fault or 'writable'}"),
+        ("cache", f"{cache.folder}: {cache.mb:.0f} MB, {disk} free, {cache.fault or told}"),
         ("kernels", cache.kernels),
     ]
     blocks = [_table(rows)]

@@ -19,7 +19,6 @@ from typing import Any, NoReturn
 
 from capture4d.cli.answers import TerminatedError, answer_to, complain
 from capture4d.cli.commands.capture import Calibrate, Check, CheckRig
-from capture4d.cli.commands.doctor import Doctor
 from capture4d.cli.commands.drape_offsets import OffsetsPredict, OffsetsTrain
 from capture4d.cli.commands.exchange import Export, ExportOnnx, Import, Score, Texture
 from capture4d.cli.commands.files import ConvertBody, ConvertPoses, ConvertRig, RegisterMesh, Template
@@ -29,6 +28,7 @@ from capture4d.cli.commands.models import Animate, Fit, FitStyle, FitStyles
 from capture4d.cli.commands.offsets import OffsetsApply, OffsetsDraw, OffsetsEdit
 from capture4d.cli.commands.stages import Extract, Register, Report, Run, Track
 from capture4d.cli.commands.synthesis import Demo, Scan, Synth, SynthBoard, SynthDrapes
+from capture4d.cli.commands.upkeep import Cache, Doctor
 from capture4d.cli.commands.wrinkles import Compare, WrinklesApply, WrinklesMaps, WrinklesOffsets, WrinklesTrain
 from capture4d.cli.exit_codes import BAD_COMMAND_LINE, BAD_INPUT, GOOD
 from capture4d.cli.help_text import command_help, overview
@@ -89,6 +89,7 @@ COMMANDS: Mapping[str, Any] = {
     "convert-rig": ConvertRig,
     "convert-poses": ConvertPoses,
     "doctor": Doctor,
+    "cache": Cache,
 }
 
 _WRITE_FILES = (Check, FitStyle, Template, RegisterMesh, Calibrate, ConvertBody, ConvertPoses, ConvertRig, Diff,

@@ -9,7 +9,7 @@ from capture4d.errors import InputError
 __all__ = ["memory_fault", "require_address_space"]
 
 _LIGHT = ("check-rig", "convert-body", "convert-poses", "convert-rig", "doctor")
-_MIDDLE = ("calibrate", "check", "extract", "register", "register-mesh", "template")
+_MIDDLE = ("cache", "calibrate", "check", "extract", "register", "register-mesh", "template")
 _NEEDED = {**dict.fromkeys(_LIGHT, 0.4e9), **dict.fromkeys(_MIDDLE, 1.0e9)}
 _MOST = 2.5e9
 """Bytes that a small take takes, libraries included, as VmPeak of /proc/self/status has it; the rest loads torch."""

@@ -97,6 +97,7 @@ QUICK = {
     "convert-rig",
     "convert-poses",
     "doctor",
+    "cache",
     "status",
     "diff",
 }

@@ -11,7 +11,7 @@ import pytest
 from packaging.requirements import Requirement
 
 from capture4d.cli import installation
-from capture4d.cli.installation import Part, diagnose, load_apart, module_of
+from capture4d.cli.installation import Part, as_text, diagnose, load_apart, module_of
 from tests.command_line import run as command
 
 
@@ -142,7 +142,10 @@ def test_the_size_of_the_cache_is_that_of_its_files(needs, own_cache: Path):
     needs()
     (own_cache / "deep").mkdir(parents=True)
     (own_cache / "deep" / "body.npz").write_bytes(bytes(3_000_000))
-    assert diagnose(load=False).cache.mb == 3.0
+    diagnosis = diagnose(load=False)
+    assert diagnosis.cache.mb == 3.0
+    assert f"{own_cache}: 3 MB" in as_text(diagnosis)
+    assert "capture4d cache names what it keeps" in as_text(diagnosis)
 
 
 def test_json_says_the_same(needs, capsys: pytest.CaptureFixture[str]):
