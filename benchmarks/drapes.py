@@ -174,7 +174,9 @@ def _simulated(draper: Draper, pose: np.ndarray) -> tuple[float, np.ndarray]:
     ]
     bodies = [with_pose(draper.person, each, np.zeros(3)) for each in way]
     bodies = [bodies[0], bodies[0], *bodies, *[bodies[-1]] * MOST_REST_FRAMES]
-    config = replace(SimulationConfig(), vertices=draper.mesh.vertex_count, calm_frames=1, hold_hz=10.0)
+    config = SimulationConfig(
+        vertices=draper.mesh.vertex_count, substeps=48, damping=0.99, calm_frames=1, hold_hz=10.0, hold_floor=0.07
+    )
     whole = replace(FABRICS["jersey"], shrink=(1.0, 1.0))  # cut smaller, it is the coarse sheet of fine folds
     frames = simulate(draper.mesh, draper.dressed, bodies, whole, config)
     before = next(frames)

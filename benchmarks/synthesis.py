@@ -1,16 +1,16 @@
 """The synthetic scanner: is the cloth cloth, are the scans scans, and what do they cost?
 
 Two fabrics, bodies and motions, arms from hanging to overhead. Limits this benchmark was built against: wrinkle
-residual at least 7 deg, determinism ratio at most 0.5, flicker at most 1.3, 99 % of edges within 1.15 of their length (1.2 with
-arms overhead), at most 0.1 % of the vertices inside the body, hem within 10 mm of the cloth solved four times as hard
-(in the first 40 frames alone), at most 2.5 and 4.5 CPU seconds a frame (mean of the takes; a take beside which another
-one is simulated on the same core costs up to a quarter more), scans of about 200,000 vertices within 0.2 mm
+residual at least 7 deg, determinism ratio at most 0.5, flicker at most 1.3, 99 % of edges within 1.15 of their length
+(1.2 with arms overhead), at most 0.1 % of the vertices inside the body, hem within 10 mm of the cloth solved four times
+as hard (in the first 40 frames alone), at most 2.5 and 4.5 CPU seconds a frame (mean of the takes; a take beside which
+another one is simulated on the same core costs up to a quarter more), scans of about 200,000 vertices within 0.2 mm
 and 4 deg of the truth.
 
 Folds: ninth decile of their turn at least 2.6 times the median, calm area 20 to 35 %, height 2.6 to 3.9 mm, in the mean
 of four poses and none of them below .85 of it; first percentile of the least stretch at least .97, at most 325 fine
-faces that cut others. Trousers (`--data trousers`) have the same limits on thigh and shin, at four moments of a walk and
-of a squat.
+faces that cut others. Trousers (`--data trousers`) have the same limits on thigh and shin, at four moments of a walk
+and of a squat.
 """
 
 from __future__ import annotations

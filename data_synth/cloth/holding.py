@@ -64,10 +64,11 @@ class Hold:
             held_from: that height in the rest pose, metres; None: that of the shoulders.
         """
         # Diffused over a coarse sheet, weights would let the thighs turn a waistband.
-        _, _, weights = bind(cloth, mesh.faces, body, smoothing=WEIGHT_SMOOTHING if held_from is None else 0)
+        at_waist = held_from is not None
+        _, _, weights = bind(cloth, mesh.faces, body, smoothing=0 if at_waist else WEIGHT_SMOOTHING)
         adjacency = vertex_adjacency(mesh.faces, mesh.vertex_count).astype(np.float64)
         around = np.asarray(adjacency.sum(axis=1)).reshape(-1, 1)
-        for _ in range(0 if made is None else made.folds.hold_spread):
+        for _ in range(0 if made is None or at_waist else made.folds.hold_spread):
             weights = 0.5 * weights + 0.5 * (adjacency @ weights) / around
         rest, flagged = unskin(cloth, weights, body.transforms)
         assert not flagged.any(), "the dressing pose cannot be unposed"

@@ -85,7 +85,7 @@ def mirrored(points: np.ndarray, mesh: PanelMesh) -> np.ndarray:
 def _simulated(mesh: PanelMesh, pattern: Pattern, body: PosedBody) -> np.ndarray:
     """A shirt that the moving simulator has closed on a body, (V, 3), the same on both sides."""
     start = dress(body.shaped, mesh, pattern, body, body.rotations)
-    config = SimulationConfig(vertices=mesh.vertex_count, hold_hz=0.0)
+    config = SimulationConfig(vertices=mesh.vertex_count, substeps=48, damping=0.99, hold_hz=0.0)
     frames = list(simulate(mesh, start, [body] * SIMULATED_FRAMES, FABRICS["jersey"], config))
     worn = (frames[-1] + mirrored(frames[-1], mesh)) / 2
     cut = count_intersecting_faces(worn, mesh.faces)

@@ -20,9 +20,7 @@ from data_synth.config import (
     TRAINING_SETS,
     MotionConfig,
     RelaxationConfig,
-    SimulationConfig,
     SynthConfig,
-    folded,
 )
 from data_synth.stage import SCHEMA
 from data_synth.take import in_view, plan_take, simulate_take
@@ -141,7 +139,7 @@ def _trunk_weights(points: np.ndarray, body) -> np.ndarray:
 
 
 def test_folds_here_and_there_remember_by_time_and_not_by_captured_frame() -> None:
-    small = folded(replace(PRESETS["tiny"], frames=2, relaxation=RelaxationConfig(vertices=2000)))
+    small = replace(PRESETS["tiny"], frames=2, relaxation=RelaxationConfig(vertices=2000))
     for every in (1, 4):
         levels = plan_take(replace(small, capture_every=every)).levels
         assert [level.config.warm_start for level in levels] == pytest.approx([0.945**every] * 2)
@@ -152,9 +150,3 @@ def test_folds_here_and_there_remember_by_time_and_not_by_captured_frame() -> No
 def test_the_cloth_of_every_preset_folds_here_and_there() -> None:
     for take in (*PRESETS.values(), *(take for each in TRAINING_SETS.values() for take in each.takes.values())):
         assert take.folds is not None, take.name
-    assert PRESETS["tshirt-200k"].simulation.vertices < SimulationConfig().vertices
-
-
-def test_what_folds_here_and_there_already_stays_as_it_is() -> None:
-    once = PRESETS["tshirt-linen-200k"]
-    assert folded(once) is once
