@@ -39,7 +39,9 @@ def parse(name: str, kind: type, arguments: Sequence[str], presets: Mapping[str,
     default = _preset(kind, arguments, presets)
     _check(name, command_options(kind, arguments, presets), arguments)
     with gathered_faults() as faults:  # tyro would print a page about each
-        parsed = tyro.cli(kind, prog=f"capture4d {name}", args=list(arguments), default=default)
+        parsed = tyro.cli(
+            kind, prog=f"capture4d {name}", args=list(arguments), default=default, config=(tyro.conf.AvoidSubcommands,)
+        )
     check_command(parsed, faults, arguments)
     return parsed
 

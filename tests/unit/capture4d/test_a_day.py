@@ -81,7 +81,8 @@ class Done:
     refined: int = 0
     """... and in the second."""
     registered: int = 0
-    drawn: int = 0
+    drawn: bool = False
+    """Frames of the report; how many, their verdicts say."""
 
 
 class Watch:
@@ -93,11 +94,11 @@ class Watch:
     }  # fmt: skip
 
     def __init__(self, work: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.work, self.drawn = work, 0
+        self.work, self.drawn = work, False
         plain = report_stage._draw_row
 
         def counted(*arguments):
-            self.drawn += 1
+            self.drawn = True
             return plain(*arguments)
 
         monkeypatch.setattr(report_stage, "_draw_row", counted)
@@ -109,7 +110,7 @@ class Watch:
     def done(self) -> Done:
         """What has been written since this was asked last."""
         now, before, drawn = self._times(), self.before, self.drawn
-        self.before, self.drawn = now, 0
+        self.before, self.drawn = now, False
         new = [path.parent.relative_to(self.work).as_posix() for path in now if now[path] != before.get(path)]
         return Done(**{name: new.count(folder) for name, folder in self.folders.items()}, drawn=drawn)
 
@@ -151,7 +152,7 @@ def test_a_day(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: 
     assert watch.done() == Done(extracted=4, tracked=4, refined=4, registered=2)
 
     assert run(*command) == 0
-    assert watch.done() == Done(registered=2, drawn=4)
+    assert watch.done() == Done(registered=2, drawn=True)
     assert run(*command) == 0
     assert watch.done() == Done(), "nothing is left to do"
 
@@ -168,7 +169,7 @@ def test_a_day(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: 
     assert "garment: 5 frames added (5-9)" in said
     assert "body: the shape of the take stays as frames 1-4 gave it; --renew shape finds it anew" in said
     # the fourth frame has a neighbour on both sides now
-    assert watch.done() == Done(extracted=5, tracked=5, refined=6, registered=6, drawn=6)
+    assert watch.done() == Done(extracted=5, tracked=5, refined=6, registered=6, drawn=True)
 
     studio.scan(8, phase=4.0)
     grow(raw, take)
@@ -176,7 +177,7 @@ def test_a_day(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: 
     assert run(*command) == 0
     assert "garment: frame 8 replaced" in capsys.readouterr().err
     # tracked on from there; the seventh frame has another neighbour
-    assert watch.done() == Done(extracted=1, tracked=2, refined=3, registered=3, drawn=6)
+    assert watch.done() == Done(extracted=1, tracked=2, refined=3, registered=3, drawn=True)
 
     shutil.copytree(work, tmp_path / "before")
     changed = [*command, "--registration.sequence.relax", "0.5"]
@@ -191,7 +192,7 @@ def test_a_day(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: 
     )
     assert watch.done() == Done(registered=3)
     assert run(*changed) == 0
-    assert watch.done() == Done(registered=6, drawn=6)
+    assert watch.done() == Done(registered=6, drawn=True)
 
     capsys.readouterr()
     assert run("diff", tmp_path / "before", work) == 0

@@ -88,7 +88,7 @@ def vertices(take: Take, folder: str = "frames") -> dict[int, np.ndarray]:
     return found
 
 
-def test_segments_are_joined_where_they_overlap(registered: Registered) -> None:
+def test_segments_are_joined_where_they_overlap(registered: Registered, garment: Garment) -> None:
     take = registered()
     found, tails, leads = (vertices(take, folder) for folder in ("frames", "tails", "leads"))
     assert list(found) == list(IDS)
@@ -101,9 +101,17 @@ def test_segments_are_joined_where_they_overlap(registered: Registered) -> None:
     assert {record["verdict"] for record in records} == {"good"}
     assert all(0 < record["seam_mm"] < 5.0 for record in records if "seam_mm" in record)
     whole = vertices(registered("whole", length=FRAMES))
-    apart = [1e3 * np.linalg.norm(found[each] - whole[each], axis=1).mean() for each in IDS]
-    assert max(apart) < 8.0
-    assert apart[:4] == [0, 0, 0, 0]
+    for frame_id in IDS[:4]:
+        np.testing.assert_array_equal(found[frame_id], whole[frame_id])
+    # How far a smooth tube turns about itself nothing tells: the two may part, but neither is the worse one.
+    mover, rest = take.mover, garment.template.vertices.astype(np.float64)
+    assert mover is not None
+    poses = (pose_frame(mover.shaped, mover.poses, row) for row in range(FRAMES))
+    places = {each: skin(rest, weights_at(rest), pose.transforms) for each, pose in zip(IDS, poses, strict=True)}
+    off, off_whole = (
+        np.mean([np.linalg.norm(made[each] - places[each], axis=1).mean() for each in IDS]) for made in (found, whole)
+    )
+    assert off < 1.5 * off_whole
 
 
 def test_a_segment_that_cannot_be_joined_goes_on_from_the_one_before(registered: Registered) -> None:

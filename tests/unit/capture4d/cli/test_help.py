@@ -65,7 +65,7 @@ def test_every_option_is_told_of_and_no_other(name: str, capsys: pytest.CaptureF
 def test_tyro_parses_what_is_told_of(name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("COLUMNS", "150")
     with contextlib.suppress(SystemExit):
-        tyro.cli(COMMANDS[name], args=["--help"])
+        tyro.cli(COMMANDS[name], args=["--help"], config=(tyro.conf.AvoidSubcommands,))
     said, spelt = capsys.readouterr().out, re.compile(r"--[a-z][\w.-]+")
     found = {word.rstrip(".") for word in spelt.findall(said)} - {"--help"}
     ours = [option for option in options_of(COMMANDS[name]) if not option.is_positional]
