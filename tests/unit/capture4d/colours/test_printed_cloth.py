@@ -40,6 +40,12 @@ def printed_column(ink: str, *, seed: int = 0) -> tuple[Scan, np.ndarray, np.nda
     return Scan(mesh, np.clip(colours, 0, 255).astype(np.uint8), 1, 0.0), garment, painted
 
 
+def around_the_front(scan: Scan) -> np.ndarray:
+    """Distances of the vertices from the middle of the front, along the column, metres."""
+    x, y, z = scan.mesh.vertices.T
+    return np.hypot(0.1 * np.arctan2(x, z), y - 0.2)
+
+
 @pytest.mark.parametrize("ink", ["blobs", "stripes", "logo"])
 def test_everything_between_the_paint_is_the_garment_whatever_its_colour(ink: str) -> None:
     scan, garment, _ = printed_column(ink)
@@ -87,8 +93,27 @@ def test_without_paint_nothing_is_told() -> None:
 def test_islands_are_what_touches_the_cloth_alone() -> None:
     scan, garment, painted = printed_column("plain")
     cloth = garment & ~painted
-    assert island_share(scan.mesh.faces, cloth, painted) == 0
+    assert island_share(scan.mesh, cloth, painted) == 0
     y = scan.mesh.vertices[:, 1]
     logo = cloth & (np.abs(y - 0.2) < 0.02) & (scan.mesh.vertices[:, 2] > 0.05)
-    share = island_share(scan.mesh.faces, cloth & ~logo, painted)
+    share = island_share(scan.mesh, cloth & ~logo, painted)
     assert share == pytest.approx(logo.sum() / (cloth & ~logo).sum())
+
+
+def test_a_piece_of_the_body_that_touches_the_cloth_beside_its_border_is_no_island() -> None:
+    """As an arm whose hand lies on the cloth, with the band of its cuff."""
+    scan, garment, painted = printed_column("plain")
+    cloth, turn = garment & ~painted, np.arctan2(*scan.mesh.vertices[:, [0, 2]].T)
+    arm = cloth & (np.abs(turn) < 0.8) & (scan.mesh.vertices[:, 1] < 0.29)
+    band = painted & ((np.abs(turn) < 0.4) | (scan.mesh.vertices[:, 1] > 0.2))
+    assert island_share(scan.mesh, cloth & ~arm, band) == 0
+
+
+def test_a_logo_with_a_blob_of_the_paints_colour_is_a_print() -> None:
+    """The blob has as many vertices as a torn piece of a band."""
+    scan, _, painted = printed_column("plain")
+    colours, away = scan.colours.copy(), around_the_front(scan)
+    assert (away < 0.013).sum() > 0.02 * painted.sum()
+    colours[away < 0.04] = SKIN
+    colours[away < 0.013] = PAINT
+    assert learn_colours([Scan(scan.mesh, colours, 1, 0.0)], paints=[PAINT]).printed
