@@ -361,7 +361,7 @@ def _ink(scans: Sequence[Scan], labels: Sequence[np.ndarray], bands: Sequence[in
         piece = face_components(faces, len(label), inside)
         largest.append(np.bincount(piece[piece >= 0], minlength=1).max() / max(int(cloth[faces].all(axis=1).sum()), 1))
         own = np.bincount(label[cloth], minlength=len(inks))
-        islands.append(island_share(scan.mesh, cloth & (label == own.argmax()), np.isin(label, bands)))
+        islands.append(island_share(faces, cloth & (label == own.argmax()), np.isin(label, bands)))
         inks += own
     if not largest or (np.median(largest) > LARGEST_PIECE and np.median(islands) < LOGO_SHARE):
         return None

@@ -12,15 +12,14 @@ from jaxtyping import Bool, Int32, UInt8
 
 from capture4d.colours.labels import FIRST_PAINT, GARMENT, OTHER
 from capture4d.geometry.mesh_kernels import face_components
-from capture4d.types import Mesh
 
 __all__ = ["between_paint", "island_share", "label_print", "without_specks"]
 
 SPECK_SHARE = 0.02
 """Painted pieces with less of all painted vertices are specks: bands are as long as their openings."""
-BAND_RIM, BAND_LENGTH = 0.25, 0.25
-"""Of a border the paint is all that lies along the cloth, but for blends with it, or there is a piece of paint at least
-a fourth as long as the longest; of a logo hardly any is, though some of its blobs may have the paint's colour."""
+BAND_RIM = 0.15
+"""Of a border the paint is all that lies along the cloth, but for blends with it, and of an arm with its cuff much of
+it, though the hand lies on the cloth; of a logo hardly any is, though some blobs may have the paint's colour."""
 SMALL_SHARE = 0.02
 """Pieces along the paint that have less of the cloth's vertices are torn off it, not pieces of the body."""
 
@@ -65,7 +64,9 @@ def between_paint(
     return (piece >= 0) & own[np.maximum(piece, 0)]
 
 
-def island_share(mesh: Mesh, cloth: Bool[np.ndarray, " verts"], painted: Bool[np.ndarray, " verts"]) -> float:
+def island_share(
+    faces: Int32[np.ndarray, "faces 3"], cloth: Bool[np.ndarray, " verts"], painted: Bool[np.ndarray, " verts"]
+) -> float:
     """How much lies in islands of other colours in the cloth, as a share of its vertices.
 
     Borders have the paint along the cloth; pieces of the body have a border there, though hands may touch the cloth.
@@ -73,16 +74,12 @@ def island_share(mesh: Mesh, cloth: Bool[np.ndarray, " verts"], painted: Bool[np
     Args:
         cloth, painted: vertices of the cloth's main colour, and of the paints.
     """
-    faces, piece = mesh.faces, _pieces(mesh.faces, ~cloth)
+    piece = _pieces(faces, ~cloth)
     rim = _beside(faces, cloth)
     rim |= _beside(faces, cloth | rim)
     along = np.bincount(piece[rim & (piece >= 0)], minlength=len(cloth))
     painted_along = np.bincount(piece[rim & painted & (piece >= 0)], minlength=len(cloth))
     islands = (along > 0) & (painted_along < BAND_RIM * along)
-    band = _pieces(faces, painted)
-    length = _lengths(mesh.vertices, band)
-    long_band = (band >= 0) & (length[np.maximum(band, 0)] >= BAND_LENGTH * length.max(initial=0))
-    islands[piece[long_band & (piece >= 0)]] = False
     size = np.bincount(piece[piece >= 0], minlength=len(cloth))
     return float(size[islands].sum() / max(int(cloth.sum()), 1))
 
@@ -101,18 +98,6 @@ def _pieces(faces: np.ndarray, inside: np.ndarray) -> np.ndarray:
     known = part >= 0
     piece[faces[known]] = part[known, None]
     return piece
-
-
-def _lengths(vertices: np.ndarray, piece: np.ndarray) -> np.ndarray:
-    """Diagonals of the pieces' boxes, by the piece's name."""
-    known = piece >= 0
-    low, high = np.full((len(piece), 3), np.inf), np.full((len(piece), 3), -np.inf)
-    np.minimum.at(low, piece[known], vertices[known])
-    np.maximum.at(high, piece[known], vertices[known])
-    named = np.isfinite(low[:, 0])
-    length = np.zeros(len(piece))
-    length[named] = np.linalg.norm(high[named] - low[named], axis=1)
-    return length
 
 
 def _contact(faces: np.ndarray, other: np.ndarray, piece: np.ndarray) -> np.ndarray:
