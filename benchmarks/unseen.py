@@ -2,7 +2,7 @@
 
 Worst over all models, motions and people:
 
-stretch_p99_worst       edge length over the template's on the person, 99th percentile of the worst frame (wanted: 1.25)
+stretch_p99_worst       edge length over the cloth's on the person, 99th percentile of the worst frame (wanted: 1.25)
 inside_body_percent     vertices inside the body, worst frame (0.3)
 farthest_mm             any vertex to the skinned template's (150)
 failed_frames           (0)

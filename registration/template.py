@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int32
 
-from capture4d.body.sewing_pattern import with_known_pattern
+from capture4d.body.sewing_pattern import rest_lengths, with_known_pattern
 from capture4d.captures.names import unknown_borders
 from capture4d.errors import InputError
-from capture4d.geometry.mesh import doubled_area_vectors, edge_uses, flat_edge_lengths, normalised, unique_edges
+from capture4d.geometry.mesh import doubled_area_vectors, edge_uses, normalised, unique_edges
 from capture4d.types import Garment
 from registration.cloth_colours import ClothColours
 from registration.config import RegistrationConfig
@@ -131,22 +131,6 @@ def require_borders(border: Border, painted: Iterable[str]) -> None:
         raise UnknownBorderError(
             f"template: expected border loops named {', '.join(missing)}, as the paints are; found {found}"
         )
-
-
-def rest_lengths(garment: Garment, edges: Int32[np.ndarray, "edges 2"]) -> Float64[np.ndarray, " edges"]:
-    """Lengths that the cloth wants: on the sewing pattern where the UVs are one, else on the template.
-
-    A draped template is stretched here and folded there; the pattern is not. Charts that were cut out of the template
-    know no more than it does, and a few per cent less: such lengths push the cloth about by millimetres
-    (`python -m benchmarks own_template`). On a seam both panels are averaged.
-
-    Args:
-        garment: one that says whether its UVs are its pattern.
-    """
-    vertices, faces, uv = garment.template.vertices.astype(np.float64), garment.template.faces, garment.template.uv
-    if uv is None or not garment.pattern_metres:
-        return np.linalg.norm(vertices[edges[:, 1]] - vertices[edges[:, 0]], axis=1)
-    return garment.pattern_metres * flat_edge_lengths(uv, faces, edges)
 
 
 def _border(garment: Garment) -> Border:

@@ -12,6 +12,7 @@ from jaxtyping import Float32, Float64
 
 from capture4d.body.binding import with_body_shape
 from capture4d.body.limbs import WornBody
+from capture4d.body.sewing_pattern import rest_lengths, with_known_pattern
 from capture4d.body.skinning import ShapedBody, pose_frame
 from capture4d.captures.animations.frame_files import AnimatedFrame
 from capture4d.geometry.intersection_removal import IntersectionRemoval
@@ -43,7 +44,11 @@ class Animator:
         self._person, self._mean = person, mean.astype(np.float32)
         faces = garment.template.faces
         self._edges = unique_edges(faces)
-        self._lengths = edge_lengths(garment.template.vertices.astype(np.float64), self._edges)
+        graded, own = (
+            edge_lengths(each.template.vertices.astype(np.float64), self._edges) for each in (garment, model.garment)
+        )
+        known = rest_lengths(with_known_pattern(model.garment), self._edges)
+        self._lengths = graded / np.maximum(own, 1e-12) * known
         # a garment that is tight on the captured person is not drawn into its wearer
         worn = edge_stretch(mean, self._edges, self._lengths)
         longest = np.maximum(config.longest, worn) if config.longest else np.inf

@@ -47,7 +47,7 @@ ANIMATION_METRICS: Mapping[str, tuple[str, str, str]] = {
     "depth_mm": ("mm", "lower", "the deepest of a frame"),
     "removal_moved_mm": ("mm", "lower", "how far taking them out has moved the others, mean"),
     "overlap_percent": ("%", "lower", "garment vertices over skin that is inside another limb"),
-    "stretch_p99": ("", "lower", "edge length over the template's on this person, 99th percentile of a frame"),
+    "stretch_p99": ("", "lower", "edge length over that of the cloth on this person, 99th percentile of a frame"),
     "stretch_p99_worst": ("", "lower", "the same of the worst frame"),
     "flipped_faces": ("", "lower", "faces turned against the body, per frame"),
 }

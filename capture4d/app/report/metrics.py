@@ -39,7 +39,11 @@ METRICS: Mapping[str, tuple[str, str, str]] = {
     "boundary_mean_mm": ("mm", "lower", "template border to the painted border of the scan, and back"),
     "boundary_p95_mm": ("mm", "lower", "the same, 95th percentile of a frame"),
     "covered_percent": ("%", "higher", "template vertices with scan data"),
-    "stretch_p99": ("", "lower", "edge length over the template's, 99th percentile of a frame"),
+    "stretch_p99": (
+        "",
+        "lower",
+        "edge length over that on the pattern, or the template without one, 99th percentile of a frame",
+    ),
     "stretch_p99_worst": ("", "lower", "the same of the worst frame"),
     "flipped_faces": ("", "lower", "faces against the scan they lie on, per frame"),
     "self_intersections": ("", "lower", "faces that cut another, per frame"),

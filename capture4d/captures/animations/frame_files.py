@@ -47,7 +47,7 @@ class AnimatedFrame:
     """Metres, world."""
     removed: Removed
     stretch_p99: float
-    """Edge length over the template's on this person, 99th percentile."""
+    """Edge length over that of the cloth on this person, 99th percentile."""
 
 
 def open_frames(
@@ -95,7 +95,7 @@ def write_frame(shared: FrameFiles, row: int, frame: AnimatedFrame) -> None:
     torn = not frame.stretch_p99 <= STRETCH_FAIL
     if not frame.stretch_p99 <= STRETCH_CHECK:
         limit = STRETCH_FAIL if torn else STRETCH_CHECK
-        reasons.append(f"edges {frame.stretch_p99:.3g} times as long as the template's > {limit:g}")
+        reasons.append(f"edges {frame.stretch_p99:.3g} times as long as the cloth's > {limit:g}")
     if distance_deg > shared.unlike_deg:
         reasons.append(f"pose {distance_deg:.0f} deg from every pose that was learned > {shared.unlike_deg:.0f}")
     if removed.after.inside_percent > INSIDE_CHECK_PERCENT:

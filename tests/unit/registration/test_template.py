@@ -5,26 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from capture4d.geometry.mesh import unique_edges
 from capture4d.types import Mesh
-from registration.template import UnknownBorderError, analyse_template, require_borders, rest_lengths
-
-
-def test_lengths_come_from_a_pattern_and_else_from_the_mesh(garment) -> None:
-    mesh = garment.template
-    edges = unique_edges(mesh.faces)
-    on_mesh = np.linalg.norm(mesh.vertices[edges[:, 0]] - mesh.vertices[edges[:, 1]], axis=1)
-    flat = np.zeros((len(mesh.faces), 3, 2), np.float32)
-    for face, corners in enumerate(mesh.vertices[mesh.faces].astype(float)):
-        along = corners[1] - corners[0]
-        length = np.linalg.norm(along)
-        second = corners[2] - corners[0]
-        flat[face, 1] = length, 0
-        flat[face, 2] = second @ along / length, np.linalg.norm(np.cross(along, second)) / length
-    for metres, expected in ((1.1, 1.1), (0.0, 1.0), (None, 1.0)):
-        told = replace(garment, template=Mesh(mesh.vertices, mesh.faces, flat), pattern_metres=metres)
-        np.testing.assert_allclose(rest_lengths(told, edges), expected * on_mesh, rtol=1e-5)
-    np.testing.assert_allclose(rest_lengths(replace(garment, pattern_metres=1.0), edges), on_mesh, rtol=1e-5)
+from registration.template import UnknownBorderError, analyse_template, require_borders
 
 
 def test_an_atlas_of_the_template_changes_nothing(garment, config) -> None:

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from capture4d.body.anny import load_anny
-from capture4d.body.sewing_pattern import as_pattern, fit_pattern, with_known_pattern
+from capture4d.body.sewing_pattern import as_pattern, fit_pattern, rest_lengths, with_known_pattern
 from capture4d.body.skinning import with_shape
 from capture4d.errors import InputError
 from capture4d.files.records import load_garment, save_garment
-from capture4d.geometry.mesh import face_areas
+from capture4d.geometry.mesh import face_areas, unique_edges
 from capture4d.geometry.uv_atlas import fresh_uv
 from capture4d.templates.body_regions import body_region
 from capture4d.types import Garment, Mesh
@@ -140,3 +140,22 @@ def test_a_pattern_by_its_owner_s_word_needs_one_scale() -> None:
         as_pattern(replace(mesh, uv=scaled_panels(mesh).astype(np.float32)))
     with pytest.raises(InputError, match="expected UVs that are a sewing pattern, found none"):
         as_pattern(Mesh(mesh.vertices, mesh.faces))
+
+
+def test_lengths_come_from_a_pattern_and_else_from_the_mesh() -> None:
+    mesh = skirt()
+    garment = Garment(mesh, {})
+    edges = unique_edges(mesh.faces)
+    on_mesh = np.linalg.norm(mesh.vertices[edges[:, 0]] - mesh.vertices[edges[:, 1]], axis=1)
+    flat = np.zeros((len(mesh.faces), 3, 2), np.float32)
+    for face, corners in enumerate(mesh.vertices[mesh.faces].astype(float)):
+        along = corners[1] - corners[0]
+        length = np.linalg.norm(along)
+        second = corners[2] - corners[0]
+        flat[face, 1] = length, 0
+        flat[face, 2] = second @ along / length, np.linalg.norm(np.cross(along, second)) / length
+    for metres, expected in ((1.1, 1.1), (0.0, 1.0), (None, 1.0)):
+        told = replace(garment, template=Mesh(mesh.vertices, mesh.faces, flat), pattern_metres=metres)
+        np.testing.assert_allclose(rest_lengths(told, edges), expected * on_mesh, rtol=1e-5)
+    bare = replace(garment, template=replace(mesh, uv=None), pattern_metres=1.0)
+    np.testing.assert_allclose(rest_lengths(bare, edges), on_mesh, rtol=1e-5)

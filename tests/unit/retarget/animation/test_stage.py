@@ -197,7 +197,7 @@ def test_cloth_does_not_stretch_unless_it_is_let_and_torn_cloth_has_failed(model
         records = load_records(tmp_path / f"{longest}" / "registration")
         stretch[longest] = max(record["stretch_p99"] for record in records)
         assert (len(result.failed) == 16) == (longest == 0.0)
-    assert "times as long as the template's > 2.5" in load_records(tmp_path / "0.0" / "registration")[3]["reasons"][0]
+    assert "times as long as the cloth's > 2.5" in load_records(tmp_path / "0.0" / "registration")[3]["reasons"][0]
     assert stretch[0.0] > 10
     assert stretch[1.2] < 2
 
