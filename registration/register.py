@@ -5,7 +5,7 @@ References: DeepWrinkles (ECCV 2018), section 3.1, Eq. 1-2; the dense stage and 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -49,6 +49,10 @@ __all__ = [
     "register_frame",
 ]
 
+SHOWN_SPACING_M = 0.003
+"""A scan of at most this spacing shows how much of an edge its folds take up. The last weight of the lengths falls with
+the fourth power of a coarser one's: what a fold takes goes by the square of slopes, which are rounded off by the square
+of the spacing."""
 PART_EDGES = 2.5
 """Cloth farther away than so many mean edges at rest is another part of the template."""
 
@@ -215,6 +219,9 @@ def _dense_stage(
         lengths = folded_lengths(
             scan.surface, vertices, analysis.faces, analysis.edges, analysis.edge_faces, analysis.rest_lengths
         )
+        shown = min(1.0, SHOWN_SPACING_M / scan.surface.spacing) ** 4
+        first, last = schedule.stretch
+        schedule = replace(schedule, stretch=(first, last * shown))
     pull, steps = None, schedule.steps
     if steps and scan.colours is not None:
         pull, steps = ColourPull(analysis, scan.surface, scan.colours, config.colour), steps + config.colour.steps
