@@ -138,7 +138,7 @@ class ScheduleConfig:
     log_every: Count = 20
     """Steps between lines of metrics.jsonl."""
     half_precision: bool = False
-    """Compute in bfloat16 where torch thinks it safe; on a CPU it pays from 32 filters up."""
+    """Compute in bfloat16 where torch thinks it safe and the processor has it; it pays from 32 filters up."""
 
 
 @settings

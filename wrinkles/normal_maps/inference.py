@@ -20,6 +20,7 @@ from capture4d.files.reading import one_line, reading
 from capture4d.files.tensors import read_tensors, write_tensors
 from capture4d.learning.checkpoints import filled
 from capture4d.types import Mesh
+from wrinkles.half_precision import has_bfloat16
 from wrinkles.normal_maps.config import MapConfig, NetworkConfig
 from wrinkles.normal_maps.networks import UNet, set_test_statistics
 
@@ -70,7 +71,8 @@ class WrinkleModel:
         heeds seams and makes maps of any size.
 
         Args:
-            half_precision: layers in bfloat16; by default where it pays, from HALF_FROM filters up. A residual is added
+            half_precision: layers in bfloat16; by default where it pays, from HALF_FROM filters up and where the processor has
+                it. A residual is added
                 in full precision.
         """
         added = self.added(low, half_precision=half_precision)[None]
@@ -91,7 +93,7 @@ class WrinkleModel:
         while image.shape[-1] > self.texels:
             image, shown = _halved(image, shown)
         if half_precision is None:
-            half_precision = self.config.filters >= HALF_FROM
+            half_precision = self.config.filters >= HALF_FROM and has_bfloat16()
         network = self._in_half_precision() if half_precision else self.generator
         seen = (image.to(torch.bfloat16) if half_precision else image).contiguous(memory_format=torch.channels_last)
         made = answer(network, seen, image, crop=self.crop)

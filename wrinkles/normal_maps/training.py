@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from capture4d.errors import InputError
 from capture4d.learning.checkpoints import read_checkpoint, write_checkpoint
+from wrinkles.half_precision import has_bfloat16
 from wrinkles.normal_maps.config import LossConfig, ScheduleConfig, WrinkleConfig
 from wrinkles.normal_maps.losses import data_loss, gan_loss, temporal_loss
 from wrinkles.normal_maps.networks import PatchDiscriminator, UNet
@@ -72,7 +73,7 @@ def train_step(state: TrainingState, batch: Batch, config: WrinkleConfig) -> dic
         optimizer.param_groups[0]["lr"] = learning_rate(state.step, config.schedule)
     state.generator.train()
     state.discriminator.train()
-    with torch.autocast("cpu", torch.bfloat16, enabled=config.schedule.half_precision):
+    with torch.autocast("cpu", torch.bfloat16, enabled=config.schedule.half_precision and has_bfloat16()):
         generated = state.generator(batch.low.contiguous(memory_format=torch.channels_last))
     generated = generated.float()
     losses = {"discriminator": 0.0}
@@ -87,7 +88,7 @@ def train_step(state: TrainingState, batch: Batch, config: WrinkleConfig) -> dic
 
 
 def _improve_discriminator(state: TrainingState, batch: Batch, generated: Tensor, config: WrinkleConfig) -> float:
-    with torch.autocast("cpu", torch.bfloat16, enabled=config.schedule.half_precision):
+    with torch.autocast("cpu", torch.bfloat16, enabled=config.schedule.half_precision and has_bfloat16()):
         real = state.discriminator(batch.low, batch.high * batch.valid)
         made = state.discriminator(batch.low, generated * batch.valid)
     loss = 0.5 * (gan_loss(real, real=True) + gan_loss(made, real=False))
@@ -106,7 +107,7 @@ def _generator_loss(
     total = weights.data * data + weights.temporal * temporal
     parts = {"data": data.item(), "temporal": temporal.item(), "gan": 0.0}
     if weights.gan > 0:
-        with torch.autocast("cpu", torch.bfloat16, enabled=config.schedule.half_precision):
+        with torch.autocast("cpu", torch.bfloat16, enabled=config.schedule.half_precision and has_bfloat16()):
             logits = state.discriminator(batch.low, generated * batch.valid)
         gan = gan_loss(logits, real=True)
         total = total + weights.gan * gan

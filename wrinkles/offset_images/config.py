@@ -60,7 +60,7 @@ class OffsetTrainingConfig:
     """The decoder learns how images differ from their mean, and the baseline without PCA starts from the mean; the
     paper says nothing of either."""
     half_precision: bool = True
-    """Compute the decoder in bfloat16 where torch thinks it safe; its losses are not."""
+    """Compute the decoder in bfloat16 where torch thinks it safe and the processor has it; its losses are not."""
     checkpoint_every: Count = 5
     """Epochs."""
 

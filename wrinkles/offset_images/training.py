@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from capture4d.learning.networks import ImageDecoder
+from wrinkles.half_precision import has_bfloat16
 from wrinkles.offset_images.canvas import Canvas, OffsetSampler, Window, drawn_values
 from wrinkles.offset_images.config import OffsetTrainingConfig
 from wrinkles.offset_images.frames import OffsetFrames, vertex_errors_cm
@@ -171,7 +172,7 @@ def _loss(training: OffsetTraining, rows: Int[Tensor, " B"], config: OffsetTrain
         return (network.layers(pose) - targets).norm(dim=-1).mean()
     if canvas is None:
         return (network(pose) - targets).norm(dim=-1).mean()
-    with torch.autocast("cpu", torch.bfloat16, enabled=config.half_precision):
+    with torch.autocast("cpu", torch.bfloat16, enabled=config.half_precision and has_bfloat16()):
         made = network(pose)
     made = made.float()
     loss = grid_loss(made, canvas.draw(targets), canvas.mask, config.norm)
