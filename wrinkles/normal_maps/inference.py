@@ -71,9 +71,8 @@ class WrinkleModel:
         heeds seams and makes maps of any size.
 
         Args:
-            half_precision: layers in bfloat16; by default where it pays, from HALF_FROM filters up and where the processor has
-                it. A residual is added
-                in full precision.
+            half_precision: layers in bfloat16; by default where it pays, from HALF_FROM filters up and where the
+                processor has it. A residual is added in full precision.
         """
         added = self.added(low, half_precision=half_precision)[None]
         if added.shape[-1] != low.shape[-1]:
