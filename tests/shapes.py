@@ -47,3 +47,15 @@ def ring(cameras: int = 12, radius: float = 2.5) -> Rig:
     sizes = np.full((cameras, 2), 513, np.int32)
     names = tuple(f"cam{index:02d}" for index in range(cameras))
     return Rig(names, np.tile(K, (cameras, 1, 1)), np.zeros((cameras, 5)), T, sizes)
+
+
+def laid_flat(mesh: Mesh) -> np.ndarray:
+    """UVs, (F, 3, 2) metres, in which every face lies by itself, as large as in the mesh."""
+    corners = mesh.vertices[mesh.faces].astype(np.float64)
+    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    length = np.linalg.norm(first, axis=1)
+    uv = np.zeros((len(corners), 3, 2), np.float32)
+    uv[:, 1, 0] = length
+    uv[:, 2, 0] = np.einsum("fc,fc->f", first, second) / length
+    uv[:, 2, 1] = np.linalg.norm(np.cross(first, second), axis=1) / length
+    return uv

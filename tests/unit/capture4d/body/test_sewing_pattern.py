@@ -13,11 +13,11 @@ from capture4d.body.sewing_pattern import as_pattern, fit_pattern, rest_lengths,
 from capture4d.body.skinning import with_shape
 from capture4d.errors import InputError
 from capture4d.files.records import load_garment, save_garment
-from capture4d.geometry.mesh import face_areas, unique_edges
+from capture4d.geometry.mesh import unique_edges
 from capture4d.geometry.uv_atlas import fresh_uv
 from capture4d.templates.body_regions import body_region
 from capture4d.types import Garment, Mesh
-from tests.shapes import tube_faces
+from tests.shapes import laid_flat, tube_faces
 
 AROUND, ALONG = 48, 24
 
@@ -105,15 +105,9 @@ def test_an_atlas_is_no_pattern_though_it_keeps_lengths() -> None:
 
 
 def _one_by_one(mesh: Mesh) -> np.ndarray:
-    corners = mesh.vertices[mesh.faces].astype(float)
-    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    length = np.linalg.norm(first, axis=1)
-    uv = np.zeros((len(corners), 3, 2))
-    uv[:, 1, 0] = length
-    uv[:, 2, 0] = np.einsum("fa,fa->f", first, second) / length
-    uv[:, 2, 1] = 2 * face_areas(mesh.vertices.astype(float), mesh.faces) / length
-    uv[..., 0] += 0.1 * np.arange(len(uv))[:, None]
-    return uv.astype(np.float32)
+    uv = laid_flat(mesh)
+    uv[..., 0] += 0.1 * np.arange(len(uv), dtype=np.float32)[:, None]
+    return uv
 
 
 def test_what_is_known_is_not_asked_again(tmp_path) -> None:
@@ -147,13 +141,7 @@ def test_lengths_come_from_a_pattern_and_else_from_the_mesh() -> None:
     garment = Garment(mesh, {})
     edges = unique_edges(mesh.faces)
     on_mesh = np.linalg.norm(mesh.vertices[edges[:, 0]] - mesh.vertices[edges[:, 1]], axis=1)
-    flat = np.zeros((len(mesh.faces), 3, 2), np.float32)
-    for face, corners in enumerate(mesh.vertices[mesh.faces].astype(float)):
-        along = corners[1] - corners[0]
-        length = np.linalg.norm(along)
-        second = corners[2] - corners[0]
-        flat[face, 1] = length, 0
-        flat[face, 2] = second @ along / length, np.linalg.norm(np.cross(along, second)) / length
+    flat = laid_flat(mesh)
     for metres, expected in ((1.1, 1.1), (0.0, 1.0), (None, 1.0)):
         told = replace(garment, template=Mesh(mesh.vertices, mesh.faces, flat), pattern_metres=metres)
         np.testing.assert_allclose(rest_lengths(told, edges), expected * on_mesh, rtol=1e-5)

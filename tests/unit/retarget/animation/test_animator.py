@@ -17,6 +17,7 @@ from retarget.animation.animator import Animator
 from retarget.animation.bodies import captured_person, retargeted_mean
 from retarget.config import AnimateConfig
 from retarget.shapes.pose_normalisation import unpose_frame
+from tests.shapes import laid_flat
 
 
 def model_on(garment: Garment, body: Body, shape: tuple[float, float]) -> BlendshapeModel:
@@ -97,14 +98,9 @@ def test_a_dent_in_the_body_is_taken_out_and_cloth_keeps_its_lengths(garment, bo
 
 def cut_longer(garment: Garment, factor: float) -> Garment:
     """The same garment with a pattern, whose lengths are so many times the template's."""
-    corners = garment.template.vertices[garment.template.faces].astype(np.float64)
-    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    length = np.linalg.norm(first, axis=1)
-    uv = np.zeros((len(corners), 3, 2), np.float32)
-    uv[:, 1, 0] = length
-    uv[:, 2, 0] = np.einsum("fc,fc->f", first, second) / length
-    uv[:, 2, 1] = np.linalg.norm(np.cross(first, second), axis=1) / length
-    return replace(garment, template=replace(garment.template, uv=factor * uv), pattern_metres=1.0)
+    return replace(
+        garment, template=replace(garment.template, uv=factor * laid_flat(garment.template)), pattern_metres=1.0
+    )
 
 
 @pytest.mark.parametrize("longer", [1.0, 1.05])
